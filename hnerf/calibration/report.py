@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.picture import draw_cameras
 from hnerf.calibration.sheet import draw_evidence
 from hnerf.calibration.synchronise import Timing
-from hnerf.capture.capture import Capture
-from hnerf.capture.formats.easymocap import write_easymocap
+from hnerf.capture.capture import Capture, possible
+from hnerf.capture.formats.easymocap import read_easymocap, write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -138,23 +136,18 @@ def _rounded(tree: Any) -> Any:
 
 def load_cameras(out: Path, capture: Capture) -> Capture:
     """Return the capture with the cameras that `save` wrote, synchronised and without rejected training cameras. The
-    capture may have fewer cameras than were calibrated. Raises InputError if the camera files cannot be read."""
-    intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_READ) for name in ("intri.yml", "extri.yml"))
-    if not (intri.isOpened() and extri.isOpened()):
-        raise InputError(f"{out}: intri.yml or extri.yml cannot be read; run the calibration stage again")
-    names = intri.getNode("names")
-    kept = [name for i in range(names.size()) if (name := names.at(i).string()) in capture.cameras]
+    capture may have fewer cameras than were calibrated. Raises ValueError if the files are not what `save` wrote."""
+    try:
+        lenses = read_easymocap(out)
+    except InputError as error:
+        raise ValueError(error) from None
     cameras = {
-        name: dataclasses.replace(
-            capture.cameras[name],
-            K=intri.getNode(f"K_{name}").mat(),
-            R=extri.getNode(f"Rot_{name}").mat(),
-            t_m=extri.getNode(f"T_{name}").mat().ravel(),
-        )
-        for name in kept
+        name: dataclasses.replace(capture.cameras[name], K=lens.K, R=lens.R, t_m=lens.t_m)
+        for name, lens in lenses.items()
+        if name in capture.cameras
     }
     train_cameras = tuple(name for name in capture.train_cameras if name in cameras)
     found = json.loads((out / "report.json").read_text())["cameras"]
     offsets = {name: found[name]["frame_offset"] for name in train_cameras if found[name]["frame_offset"]}
-    used = dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras)
+    used = possible(dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras))
     return used.synchronised(offsets) if offsets else used

@@ -15,7 +15,10 @@ import cv2
 import numpy as np
 
 from hnerf.capture.bars import Area
+from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.capture.given_poses import GivenPoses
+from hnerf.capture.lens import checked_lens
+from hnerf.capture.safe_io import check_image_size
 from hnerf.capture.timing import median_step, nearest_frame, resample
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -199,11 +202,11 @@ class Capture:
 
     @staticmethod
     def load(root: Path) -> "Capture":
-        """Read a normalised capture folder."""
+        """Read a normalised capture folder. Raises ValueError, InputError or others if `save` did not write it."""
         plain: dict[str, Any] = json.loads((root / "capture.json").read_text())
         del plain["units"]
         cameras = {
-            name: Camera(name, np.array(c["K"]), np.array(c["R"]), np.array(c["t_m"]), *c["size_px"])
+            name: _camera(root / "capture.json", name, *(np.array(c[key]) for key in ("K", "R", "t_m")), c["size_px"])
             for name, c in plain.pop("cameras").items()
         }
         tuples = ("train_cameras", "test_cameras", "train_frames", "novel_pose_frames")
@@ -214,7 +217,25 @@ class Capture:
         plain["picture_areas_px"] = {name: Area(*area) for name, area in plain.get("picture_areas_px", {}).items()}
         if point := plain.get("subject_point"):
             plain["subject_point"] = SubjectPoint(tuple(point[0]), *point[1:])
-        return Capture(root=root, cameras=cameras, **plain)
+        return possible(Capture(root=root, cameras=cameras, **plain))
+
+
+def _camera(source: Path, name: str, K: np.ndarray, R: np.ndarray, t_m: np.ndarray, size_px: list[int]) -> Camera:
+    """Return a camera of a file. Raises InputError, or ValueError among others, if it is none."""
+    lens = checked_lens((source, source), name, K, np.zeros(4), R, t_m, None)
+    return Camera(name, lens.K, lens.R, lens.t_m, *check_image_size(source, *size_px))
+
+
+def possible(capture: Capture) -> Capture:
+    """Return a capture as it is. Raises ValueError unless it has training cameras, all its cameras are known, it has a
+    frame rate, and a vertical axis."""
+    if not capture.train_cameras or not {*capture.train_cameras, *capture.test_cameras} <= capture.cameras.keys():
+        raise ValueError("no training camera, or an unknown camera")
+    if not MIN_FPS <= capture.fps <= MAX_FPS:
+        raise ValueError(f"fps: {capture.fps}")
+    if capture.up not in ("y", "z"):
+        raise ValueError(f"up: {capture.up}")
+    return capture
 
 
 def read_rgb(path: Path) -> np.ndarray:

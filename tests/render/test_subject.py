@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -215,6 +216,69 @@ def test_a_copy_with_a_file_that_is_cut_is_one_line(
     assert main(["render", str(copy), "--out", str(tmp_path / "out"), *view]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"hnerf: {copy / named}: damaged, or written by another version (")
+    assert not (tmp_path / "out").exists()
+
+
+def _set(file: str, **changes: object) -> Callable[[Path], object]:
+    """Return what replaces keys of a subject's JSON file."""
+    return lambda subject: (subject / file).write_text(json.dumps(json.loads((subject / file).read_text()) | changes))
+
+
+def _set_camera(**changes: object) -> Callable[[Path], object]:
+    """Return what replaces keys of camera 2 in a subject's capture."""
+
+    def change(subject: Path) -> None:
+        cameras = json.loads((subject / "capture/capture.json").read_text())["cameras"]
+        _set("capture/capture.json", cameras=cameras | {"2": cameras["2"] | changes})(subject)
+
+    return change
+
+
+def _replace(file: str, old: str, new: str) -> Callable[[Path], object]:
+    """Return what replaces text of a file of a subject's calibration."""
+
+    def change(subject: Path) -> None:
+        text = (subject / "calibration" / file).read_text()
+        assert old in text
+        (subject / "calibration" / file).write_text(text.replace(old, new, 1))
+
+    return change
+
+
+NONSENSE = {
+    "no training cameras": (_set("capture/capture.json", train_cameras=[]), "capture.json: damaged"),
+    "an unknown training camera": (_set("capture/capture.json", train_cameras=["zz"]), "capture.json: damaged"),
+    "no cameras": (_set("capture/capture.json", cameras={}), "capture.json: damaged"),
+    "another axis": (_set("capture/capture.json", up="w"), "(up: w)"),
+    "a number for an axis": (_set("capture/capture.json", up=3), "(up: 3)"),
+    "a word for a frame rate": (_set("capture/capture.json", fps="x"), "capture.json: damaged"),
+    "no frame rate": (_set("capture/capture.json", fps=0), "(fps: 0)"),
+    "words for a size": (_set_camera(size_px=["a", "b"]), "capture.json: damaged"),
+    "an endless size": (_set_camera(size_px=[10**9, 10**9]), "capture.json: declares"),
+    "a camera nowhere": (_set_camera(t_m=[float("nan")] * 3), "capture.json: camera 2: T holds a NaN"),
+    "a lens of one number": (_set_camera(K=[[1]]), "capture.json: camera 2: K has 1 numbers"),
+    "no K": (_replace("intri.yml", "K_2:", "K_9:"), "calibration: damaged"),
+    "no rotation": (_replace("extri.yml", "Rot_2:", "Rot_9:"), "calibration: damaged"),
+    "no names": (_replace("intri.yml", "names:", "nam:"), "calibration: damaged"),
+    "a small K": (_replace("intri.yml", "rows: 3\n   cols: 3", "rows: 2\n   cols: 2"), "calibration: damaged"),
+    "nested deeply": (
+        lambda f: (f / "calibration/intri.yml").write_text("a: " + "[" * 200_000),
+        "calibration: damaged",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", NONSENSE)
+def test_a_copy_that_parses_and_makes_no_sense_is_one_line(
+    case: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Deep nesting overflows the stack of OpenCV's own parser."""
+    damage, message = NONSENSE[case]
+    copy = shutil.copytree(subject, tmp_path / "copy")
+    damage(copy)
+    assert main(["render", str(copy), "--out", str(tmp_path / "out"), "--frames", "0", "--pictures", "1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"hnerf: {copy}/") and message in line
     assert not (tmp_path / "out").exists()
 
 

@@ -26,10 +26,7 @@ class EasyMocap(Layout):
 
     def lenses(self) -> dict[str, Lens]:
         """Return every camera that intri.yml names."""
-        intri = _CalibrationFile(safe_io.path_in_capture(self.folder, "intri.yml"))
-        extri = _CalibrationFile(safe_io.path_in_capture(self.folder, "extri.yml"))
-        lenses = (_lens(name, intri, extri) for name in intri.names())
-        return by_name(lenses, intri.path)
+        return _lenses(self.folder, ("R", "Rot"))
 
     def footage(self, camera: str) -> Footage:
         """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""
@@ -80,6 +77,12 @@ def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:
         extri += _matrix(f"T_{lens.name}", lens.t_m[:, None])
     (out / "intri.yml").write_text(intri, encoding="utf-8")
     (out / "extri.yml").write_text(extri, encoding="utf-8")
+
+
+def read_easymocap(folder: Path) -> dict[str, Lens]:
+    """Return the lenses that `write_easymocap` wrote, with the same rotations to the last digit. Raises InputError if
+    they are none."""
+    return _lenses(folder, ("Rot",))
 
 
 def _matrix(key: str, values: np.ndarray) -> str:
@@ -148,8 +151,16 @@ class _CalibrationFile:
         return found
 
 
-def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None) -> Lens:
-    """Return the lens of one camera; at the origin without a file of extrinsics."""
+def _lenses(folder: Path, rotations: tuple[str, ...]) -> dict[str, Lens]:
+    """Return every camera that intri.yml names. rotations: as in `_lens`."""
+    intri = _CalibrationFile(safe_io.path_in_capture(folder, "intri.yml"))
+    extri = _CalibrationFile(safe_io.path_in_capture(folder, "extri.yml"))
+    return by_name((_lens(name, intri, extri, rotations) for name in intri.names()), intri.path)
+
+
+def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None, rotations: tuple[str, ...] = ()) -> Lens:
+    """Return the lens of one camera; at the origin without a file of extrinsics. rotations: what the rotation is called
+    there, the first that exists."""
     distortion = intri.matrix(f"dist_{name}", f"D_{name}")
     width_px, height_px = sides = intri.number(f"W_{name}"), intri.number(f"H_{name}")
     if sides.count(None) == 1:
@@ -159,7 +170,7 @@ def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None) ->
         name=name,
         K=intri.required(f"K_{name}"),
         distortion=np.zeros(4) if distortion is None else distortion,
-        R=extri.required(f"R_{name}", f"Rot_{name}") if extri else np.eye(3),
+        R=extri.required(*(f"{kind}_{name}" for kind in rotations)) if extri else np.eye(3),
         t_m=extri.required(f"T_{name}") if extri else np.zeros(3),
         size_px=(width_px, height_px) if width_px is not None and height_px is not None else None,
     )
