@@ -205,10 +205,7 @@ class Capture:
         """Read a normalised capture folder. Raises ValueError, InputError or others if `save` did not write it."""
         plain: dict[str, Any] = json.loads((root / "capture.json").read_text())
         del plain["units"]
-        cameras = {
-            name: _camera(root / "capture.json", name, *(np.array(c[key]) for key in ("K", "R", "t_m")), c["size_px"])
-            for name, c in plain.pop("cameras").items()
-        }
+        cameras = {name: _camera(root / "capture.json", name, c) for name, c in plain.pop("cameras").items()}
         tuples = ("train_cameras", "test_cameras", "train_frames", "novel_pose_frames")
         sizes = ("calibrated_sizes_px", "recorded_sizes_px")
         plain |= {k: tuple(plain[k]) for k in tuples}
@@ -220,10 +217,11 @@ class Capture:
         return possible(Capture(root=root, cameras=cameras, **plain))
 
 
-def _camera(source: Path, name: str, K: np.ndarray, R: np.ndarray, t_m: np.ndarray, size_px: list[int]) -> Camera:
-    """Return a camera of a file. Raises InputError, or ValueError among others, if it is none."""
+def _camera(source: Path, name: str, described: dict[str, Any]) -> Camera:
+    """Return a camera as a file describes it. Raises ValueError, InputError or others if it is none."""
+    K, R, t_m = (np.array(described[key]) for key in ("K", "R", "t_m"))
     lens = checked_lens((source, source), name, K, np.zeros(4), R, t_m, None)
-    return Camera(name, lens.K, lens.R, lens.t_m, *check_image_size(source, *size_px))
+    return Camera(name, lens.K, lens.R, lens.t_m, *check_image_size(source, *described["size_px"]))
 
 
 def possible(capture: Capture) -> Capture:
