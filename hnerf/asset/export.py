@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from threadpoolctl import threadpool_limits
 
 from hnerf.asset.baking import baked_textures
 from hnerf.asset.bvh_file import write_avatar_bvh
@@ -91,6 +92,7 @@ class MeshAsset:
     seconds: dict[str, float]
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # more threads round sums differently, and give other bytes
 def export_asset(
     capture: Capture,
     masks: Masks,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from pxr import Usd, UsdGeom
+from threadpoolctl import threadpool_info, threadpool_limits
 from torch import Tensor
 
 from hnerf.asset.export import _clothed_surface, _rest_meshes, export_asset
@@ -141,3 +142,16 @@ def test_nothing_is_written_of_an_asset_far_below_its_field(tmp_path: Path, monk
     with pytest.raises(InvalidAsset, match=r"registered mesh is below its field: .* 10\.0 dB"):
         export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), tiny, tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_sums_are_rounded_as_on_one_thread_however_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[int] = []
+
+    def stop(*_: object) -> None:
+        found.extend(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+        raise InvalidAsset("stopped")
+
+    monkeypatch.setattr("hnerf.asset.export._rest_meshes", stop)
+    with threadpool_limits(2, "blas"), pytest.raises(InvalidAsset):
+        export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), SMALL, Path("unused"))
+    assert found and set(found) == {1}
