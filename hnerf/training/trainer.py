@@ -148,7 +148,7 @@ class Trainer:
                 self._absorb()
             if snapshot_due:
                 if self.processes.is_main:
-                    self._save(self.out / "snapshots" / f"{snapshots_s[0]:g}")
+                    self._save(self._snapshot(snapshots_s[0]))
                 snapshots_s.pop(0)
                 self.processes.barrier()
                 started = time.monotonic() - self.seconds  # writing snapshots does not count
@@ -276,7 +276,7 @@ class Trainer:
 
     def _resume(self) -> None:
         state = load_checkpoint(self.out, self.processes.device, self.key)
-        if state is None:
+        if state is None or self._lacks_snapshots(state["seconds"]):
             return
         self.step, self.skipped, self.seconds = state["step"], state["skipped"], state["seconds"]
         self.field_steps, self.field_seconds = state["field_steps"], state["field_seconds"]
@@ -291,6 +291,18 @@ class Trainer:
         if self.step > self.field_steps:
             self._freeze_field()
         logger.info("resumed at step %d", self.step)
+
+    def _lacks_snapshots(self, seconds: float) -> bool:
+        """Return whether a snapshot is not there that was due in the first `seconds`, as where another machine made the
+        checkpoint; warn if so."""
+        due_s = [s for s in self.settings.snapshots_s if s <= seconds]
+        missing = [str(folder) for folder in map(self._snapshot, due_s) if not (folder / "settings.json").exists()]
+        if missing:
+            logger.warning("%s: not there, though the checkpoint is later; the training starts again", missing[0])
+        return bool(missing)
+
+    def _snapshot(self, seconds: float) -> Path:
+        return self.out / "snapshots" / f"{seconds:g}"
 
     def _save(self, folder: Path) -> None:
         """Write what `load_avatar` reads: field, settings and fine-tuned body."""

@@ -164,6 +164,21 @@ def test_a_snapshot_is_a_subject(tmp_path: Path):
     assert early.render(capture.cameras["0"], early.body.theta[0], early.body.root[0]).alpha.max() > 0.5
 
 
+def test_a_checkpoint_without_the_snapshots_before_it_is_discarded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Another machine has them; those that are not due yet are of no concern."""
+    recording, snapshot = record(tmp_path / "capture"), tmp_path / "snapshots"
+    settings = tiny(snapshots_s=[1e-6, 1e6], steps=2, novel_pose_steps=0)
+    train(*recording, settings, tmp_path, ALONE)
+    train(*recording, settings, tmp_path, ALONE)
+    assert caplog.text == ""
+    snapshot.rename(tmp_path / "elsewhere")
+    train(*recording, settings, tmp_path, ALONE)
+    assert "snapshots/1e-06: not there, though the checkpoint is later; the training starts again" in caplog.text
+    assert [path.name for path in snapshot.iterdir()] == ["1e-06"]
+
+
 def test_a_model_of_another_version_is_refused(tmp_path: Path):
     capture, masks, body = record(tmp_path / "capture")
     Trainer(capture, masks, body, tiny(steps=1, novel_pose_steps=0), tmp_path, ALONE).run()
