@@ -94,7 +94,8 @@ class Inventory:
         roots = pinned(self.store.root)
         for subject, links in self.latest.items():
             roots |= set(links.values())
-            newest = [one.artifact for one in self.of_subject(subject)[::-1]] if keep > 1 else []
+            ended_early = "asset" not in links  # a run that replaced the links of a finished one
+            newest = [one.artifact for one in self.of_subject(subject)[::-1]] if keep > 1 or ended_early else []
             assets = [one for one in newest if one.stage == "asset"][:keep]  # with which runs end, and nothing else
             trained = {name for one in assets for name in one.inputs if name.startswith("training/")}
             scores = [one for one in newest if one.stage == "evaluation" and trained & set(one.inputs)]

@@ -53,6 +53,13 @@ def test_more_results_of_each_subject_can_be_kept(store: Store) -> None:
     assert garbage(store, keep=2) == names(first) and garbage(store, keep=1) == names(first + second)
 
 
+def test_a_run_that_ended_early_does_not_cost_the_finished_one(store: Store) -> None:
+    first, second = run_of(store, "ada", 10), run_of(store, "ada", 20)
+    store.link_latest("ada", add(store, "fit", 30, second[0]))
+    assert Inventory.of(store).latest["ada"].keys() == {"capture", "fit"}
+    assert garbage(store) == names(first)
+
+
 def test_rows_of_an_ablation_are_no_results(store: Store) -> None:
     """They end with an evaluation, and nobody links to them."""
     first, second = run_of(store, "ada", 10), run_of(store, "ada", 20)
