@@ -6,10 +6,12 @@ import os
 import shutil
 import signal
 import time
+import zlib
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile, ZipFile
 
 import cv2
 import numpy as np
@@ -92,7 +94,7 @@ def _with_own(capture: Capture, people: dict[str, np.ndarray]) -> dict[str, np.n
 
 def _find_people(capture: Capture, size: str, out: Path) -> dict[str, float]:
     """Write what `find_in_camera` writes of each camera that has none yet; return what it returns by camera."""
-    waiting = [name for name in capture.train_cameras if not (out / LANDMARKS / f"{name}.npz").exists()]
+    waiting = [name for name in capture.train_cameras if not _is_whole(out / LANDMARKS / f"{name}.npz")]
     if len(waiting) < 2:
         return {name: find_in_camera(capture, name, size, out) for name in waiting}
     processes = min(len(waiting), len(os.sched_getaffinity(0)))
@@ -141,6 +143,8 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> float
             masks=_by_frame(everybody, lambda person: person.mask, (SIZE, SIZE), np.uint8),
             regions=_by_frame(everybody, lambda person: np.array([*person.region.centre_px, *person.region[1:]]), (4,)),
         )
+        file.flush()
+        os.fsync(file.fileno())
     os.replace(beside, path)
     return 1e3 * (time.perf_counter() - started) / len(capture.frames)
 
@@ -166,6 +170,15 @@ def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarra
 
 def _eight_bit(likely: np.ndarray) -> np.ndarray:
     return (255 * likely).round().astype(np.uint8)
+
+
+def _is_whole(path: Path) -> bool:
+    """Return whether a file of landmarks is there, with all its bytes."""
+    try:
+        with ZipFile(path) as stored:
+            return stored.testzip() is None
+    except (OSError, EOFError, BadZipFile, zlib.error):
+        return False
 
 
 def _load(out: Path, camera: str, *names: str) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,18 @@ def test_cameras_that_are_done_are_not_looked_at_again(recording: Capture, tmp_p
     detect(recording, NETWORK, tmp_path / "out")
     detect(recording, NETWORK, tmp_path / "out")
     assert MadeUp.seen == 5
+
+
+@pytest.mark.parametrize("damage", [lambda whole: b"", lambda whole: whole[:60] + whole[61:]])
+def test_a_camera_whose_landmarks_were_cut_is_looked_at_again(
+    recording: Capture, tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    detect(recording, NETWORK, tmp_path / "out")
+    landmarks = tmp_path / "out" / "landmarks" / "01.npz"
+    whole = landmarks.read_bytes()
+    landmarks.write_bytes(damage(whole))
+    detect(recording, NETWORK, tmp_path / "out")
+    assert MadeUp.seen == 10 and landmarks.read_bytes() == whole
 
 
 def test_people_found_again_are_the_same_files_however_long_it_took(recording: Capture, tmp_path: Path) -> None:
