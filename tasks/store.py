@@ -20,6 +20,7 @@ import fcntl
 import hashlib
 import json
 import logging
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
@@ -129,7 +130,8 @@ class Store:
         inputs: Iterable[str] = (),
         checkpoint: str = "",
     ) -> Artifact:
-        """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics.
+        """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics, of which
+        those that are finite are kept.
 
         If several callers want the same artifact, one computes it and the others wait. The folder of a resumable stage
         survives a crash, and the next call resumes in it; any other starts empty. Links that lie in the way are not
@@ -157,7 +159,8 @@ class Store:
                     shutil.rmtree(partial)
                 raise
             pin(self.root, f"{stage}/{key}")
-            made = Artifact(stage=stage, root=self.path(stage, key), files={}, metrics=metrics,
+            finite = {name: value for name, value in metrics.items() if math.isfinite(value)}  # JSON has no others
+            made = Artifact(stage=stage, root=self.path(stage, key), files={}, metrics=finite,
                             inputs=tuple(sorted(set(inputs))))  # fmt: skip
             return self.commit(made, checkpoint)
 

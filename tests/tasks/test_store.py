@@ -1,4 +1,5 @@
 import errno
+import math
 import multiprocessing
 import os
 import shutil
@@ -45,6 +46,13 @@ def test_digest_is_of_names_and_bytes_only(tmp_path: Path) -> None:
     renamed = first.model_copy(update={"files": {"deep/lettres": first.files["deep/letters"]}})
     assert first.digest == second.digest
     assert first.digest != renamed.digest
+
+
+def test_a_metric_that_is_not_finite_is_left_out(tmp_path: Path) -> None:
+    metrics = {"nan": math.nan, "endless": math.inf, "one": 1.0}
+    made = Store(tmp_path).get_or_compute("segmentation", "k", lambda out: metrics)
+    assert made.metrics == {"one": 1.0}
+    assert Store(tmp_path).get_or_compute("segmentation", "k", never) == made
 
 
 @pytest.mark.parametrize("error", [RuntimeError("crash"), KeyboardInterrupt(), InputError("a.jpg: bad")])
