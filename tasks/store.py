@@ -158,7 +158,6 @@ class Store:
                 if not resumable or isinstance(error, InputError):
                     shutil.rmtree(partial)
                 raise
-            pin(self.root, f"{stage}/{key}")
             finite = {name: value for name, value in metrics.items() if math.isfinite(value)}  # JSON has no others
             made = Artifact(stage=stage, root=self.path(stage, key), files={}, metrics=finite,
                             inputs=tuple(sorted(set(inputs))))  # fmt: skip
@@ -258,7 +257,8 @@ class Store:
 
     def commit(self, artifact: Artifact, checkpoint: str = "") -> Artifact:
         """Record the files in the artifact's `.partial` folder, and put them in place; its lock must be held. What
-        begins with the name `checkpoint` is deleted last."""
+        begins with the name `checkpoint` is deleted last. From here on this process uses the artifact."""
+        pin(self.root, artifact.name)
         stage, key = artifact.stage, artifact.root.name
         partial, folder, record = (self.path(stage, key, suffix) for suffix in (".partial", "", ".json"))
         kept = set(partial.glob(f"{checkpoint}*")) if checkpoint else set()

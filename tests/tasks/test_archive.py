@@ -55,6 +55,19 @@ def test_a_run_beside_it_that_has_some_keeps_them(packed: Path, tmp_path: Path) 
     assert names([made]) <= Inventory.of(store).stored.keys()
 
 
+def test_what_is_not_linked_yet_is_in_use(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else `gc --older 0` beside it could remove what was just put there."""
+
+    def placed(store: Store, name: str, *rest: Any) -> None:
+        place(store, name, *rest)
+        used.append(name in Inventory.of(store).needed())
+
+    used, place = list[bool](), module.place
+    monkeypatch.setattr("tasks.archive.place", placed)
+    import_subject(Store(tmp_path / "to"), packed)
+    assert used == 6 * [True]
+
+
 def test_a_name_of_another_recording_is_refused(packed: Path, tmp_path: Path) -> None:
     store = Store(tmp_path / "to")
     store.claim("ada", "b" * 64, Path("/recordings/another"))
