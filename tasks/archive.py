@@ -73,7 +73,7 @@ def import_subject(store: Store, path: Path) -> Manifest:
                     place(store, name, one, scratch)
         if manifest.recording:
             digest, _, folder = manifest.recording.strip().partition("\n")
-            store.claim(manifest.subject, digest, Path(folder))
+            store.claim(manifest.subject, digest, folder)
         for stage in sorted(manifest.latest, key=STAGES.index):
             store.link_latest(manifest.subject, _intact(store, *manifest.latest[stage].split("/")))
     return manifest

@@ -55,6 +55,15 @@ def test_a_run_beside_it_that_has_some_keeps_them(packed: Path, tmp_path: Path) 
     assert names([made]) <= Inventory.of(store).stored.keys()
 
 
+def test_a_recording_in_a_bucket_keeps_its_url(tmp_path: Path) -> None:
+    before, after = Store(tmp_path / "from"), Store(tmp_path / "to")
+    run_of(before, "ada", 10)
+    before.claim("ada", "a" * 64, "s3://bucket/ada")
+    export_subject(before, "ada", tmp_path / "ada.tar")
+    import_subject(after, tmp_path / "ada.tar")
+    assert after.recording("ada") == before.recording("ada")
+
+
 def test_what_is_not_linked_yet_is_in_use(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else `gc --older 0` beside it could remove what was just put there."""
 
