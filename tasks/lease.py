@@ -52,8 +52,8 @@ def leased(bucket: Bucket, name: str) -> Iterator[bool]:
         beats.join()
         with suppress(BucketError, InputError):  # else it expires
             if finished:
-                for before in range(turn + 1):
-                    bucket.remove(_note(name, before))
+                for taken in range(turn, -1, -1):  # the last one first: turns are counted up to the first gap
+                    bucket.remove(_note(name, taken))
             else:
                 bucket.write_note(_note(name, turn), FREE)
 

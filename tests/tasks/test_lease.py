@@ -3,11 +3,12 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Barrier, Event, Thread
+from unittest.mock import Mock
 
 import pytest
 
 from tasks import lease
-from tasks.bucket import Bucket
+from tasks.bucket import Bucket, BucketError
 from tasks.lease import FREE, leased
 
 NAME = "fit/k"
@@ -86,3 +87,19 @@ def test_given_up_work_can_be_taken_at_once(bucket: Bucket) -> None:
         assert mine
         assert notes(bucket) == ["k.lease.0", "k.lease.1"]
     assert notes(bucket) == []
+
+
+def test_turns_that_are_only_partly_removed_have_no_gap(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a gap, nobody would see the next owner, and two would work at once."""
+
+    def remove_one(self: Bucket, name: str) -> None:
+        monkeypatch.setattr(Bucket, "remove", Mock(side_effect=BucketError("away")))
+        remove(self, name)
+
+    with pytest.raises(KeyboardInterrupt), leased(bucket, NAME):
+        raise KeyboardInterrupt
+    remove = Bucket.remove
+    monkeypatch.setattr(Bucket, "remove", remove_one)
+    with leased(bucket, NAME):
+        pass
+    assert notes(bucket) == ["k.lease.0"]
