@@ -1,9 +1,10 @@
-"""Common base of the compared methods: rays are sampled in the person's box, and in its coordinates."""
+"""Common bases of the compared methods: rays are sampled in the person's box, and in its coordinates."""
 
+from abc import abstractmethod
 from typing import Any, Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -70,6 +71,37 @@ class BoxField(Field):
         larger, within BAND_M. Only its sign and its zero set are meaningful, not its size."""
         threshold = SURFACE_DENSITY_PER_M * self.scale_m
         return BAND_M * (threshold - density) / (threshold + density)
+
+
+class StaticField(BoxField):
+    """Base of NeRF and IDR: a static scene in world coordinates; of the fitted body it uses only the box."""
+
+    def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
+        """Return the signed distance (N,) in metres at points (N, 3), cut and closed by the box of the first body."""
+        return torch.maximum(self.distance(points_m), self.box(bodies).signed_distance(points_m))
+
+    @abstractmethod
+    def distance(self, points_m: Tensor) -> Tensor:
+        """Return the network's own signed distance (N,) in metres at points (N, 3) in the box."""
+
+
+class DynamicField(BoxField):
+    """Base of NeuralBody and Nerfies: a density field and a learned code per frame. Codes start at zero and stay zero
+    for frames that are not trained on; a pose of no frame (Conditions.frame_row = -1) takes the zero code."""
+
+    def __init__(self, body: BodyFit, samples: int, learning_rate: float, code_width: int):
+        super().__init__(body, samples, learning_rate)
+        self.codes = nn.Parameter(torch.zeros(len(body.frames), code_width))
+
+    def code(self, conditions: Conditions) -> Tensor:
+        """Return the codes by body row, (n, code_width)."""
+        unseen = torch.zeros_like(self.codes[:1])
+        return torch.cat([self.codes, unseen])[conditions.frame_row]  # -1 is the last row
+
+    def to_samples(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor, **extra: Any) -> RaySamples:
+        """Build samples from density (R, K) and colour (R, K, 3) at depths (R, K); the last sample extends to the end
+        of the box."""
+        return box_samples(self.opacity(density, depths_m, far_m), colour, self.pseudo_distance(density), **extra)
 
 
 def box_samples(alpha: Tensor, colour: Tensor, d: Tensor, **given: Any) -> RaySamples:

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import box_samples
-from hnerf.baselines.static import StaticField
+from hnerf.baselines.box import StaticField, box_samples
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import NerfSettings

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.dynamic import DynamicField
+from hnerf.baselines.box import DynamicField
 from hnerf.baselines.nerf import NerfNetwork
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.dynamic import DynamicField
+from hnerf.baselines.box import DynamicField
 from hnerf.baselines.nerf import DENSITY_GAIN
 from hnerf.baselines.voxels import Voxels
 from hnerf.body.canonical import PosedBodies
