@@ -11,7 +11,6 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.evaluation.ground_truth import GroundTruth
-from hnerf.study.degradations import catalogue
 from hnerf.study.degradations.catalogue import Degradation
 from hnerf.study.degradations.fit import extreme_poses
 from hnerf.study.surface import SurfaceCheck, check_pose, check_surface
@@ -37,7 +36,7 @@ def degrade_clothing(
 ) -> dict[str, float]:
     """Write a capture whose person wears added clothes or hair, and its ground truth likewise under `ground_truth/`."""
     capture = calibrated_capture(recording, calibration)
-    catalogue.degrade_clothing(capture, BodyFit.load(body.root), GroundTruth(truth.root, capture), degradation, out)
+    degradation.apply(capture, BodyFit.load(body.root), GroundTruth(truth.root, capture), out=out)
     require_unchanged(truth)
     return {}
 

@@ -64,7 +64,7 @@ def test_what_is_worn_is_kept_only_with_the_ground_truth_of_its_key(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "calibrated_capture", lambda recording, _: Capture.load(recording.root))
-    monkeypatch.setattr(module.catalogue, "degrade_clothing", lambda *_: None)
+    monkeypatch.setattr(Degradation, "apply", lambda *_, **__: None)
     worn, good = Degradation(kind="skirt", strength=0.1, seed=0), recording(store)
     mesh = tmp_path / "ada" / "ground_truth" / "meshes.npz"
     mesh.parent.mkdir(parents=True)

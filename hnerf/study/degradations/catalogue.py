@@ -4,16 +4,13 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
-from hnerf.body.fit_result import BodyFit
-from hnerf.capture.capture import Capture
 from hnerf.config import Section, TrainingSettings
 from hnerf.errors import InputError
-from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.degradations import cameras as degraded_rig
 from hnerf.study.degradations import clothing as degraded_clothing
 from hnerf.study.degradations import fit as degraded_fit
@@ -38,10 +35,11 @@ class Degradation(Section):
         return np.random.default_rng(self.seed)
 
     def apply(self, *what: Any, **where: Any) -> Any:
-        """Write a degraded capture, normalised like the one given, into a folder `out`; or return degraded masks of the
-        same views, given masks and their capture, or a body fit with degraded poses or shape."""
+        """Write a degraded capture, normalised like the one given, into a folder `out`, for clothing with its ground
+        truth; or return degraded masks of the same views, given masks and their capture, or a body fit with degraded
+        poses or shape."""
         change = KINDS[self.kind].change
-        assert change is not None  # degradations of capture, masks and fit have one
+        assert change is not None  # degradations of capture, clothing, masks and fit have one
         return change(*what, self.strength, self.rng, **where)
 
 
@@ -79,8 +77,12 @@ KINDS = {
     "small_images": DegradationKind("capture", "image size, share", degraded_images.resize, 1, 0),
     "large_images": DegradationKind("capture", "image size, multiple", degraded_images.resize, 1),
     "occluder": DegradationKind("capture", "pillar in front, width in m", occluder.add_pillar),
-    "skirt": DegradationKind("clothing", "skirt, hem off the legs in m"),
-    "long_hair": DegradationKind("clothing", "long hair, m"),
+    "skirt": DegradationKind(
+        "clothing", "skirt, hem off the legs in m", partial(degraded_clothing.add_clothing, degraded_clothing.skirt)
+    ),
+    "long_hair": DegradationKind(
+        "clothing", "long hair, m", partial(degraded_clothing.add_clothing, degraded_clothing.long_hair)
+    ),
     "mask_eroded": DegradationKind("masks", "masks eroded, % of image width", degraded_masks.erode),
     "mask_dilated": DegradationKind("masks", "masks dilated, % of image width", degraded_masks.dilate),
     "mask_holes": DegradationKind("masks", "holes, % of each mask", degraded_masks.cut_holes, limit=100),
@@ -91,11 +93,6 @@ KINDS = {
     "learning_rate_down": DegradationKind("settings", "learning rate lower, times", neutral=1, limit=0),
     "extreme_poses": DegradationKind("poses", "new pose, ° a joint"),
 }
-
-
-def degrade_clothing(capture: Capture, body: BodyFit, truth: GroundTruth, degradation: Degradation, out: Path) -> None:
-    """Write into `out` the capture and its ground truth with clothes or hair that no body model expresses."""
-    degraded_clothing.add_clothing(degradation.kind, degradation.strength, degradation.rng, capture, body, truth, out)
 
 
 def degrade_settings(settings: TrainingSettings, degradation: Degradation) -> TrainingSettings:

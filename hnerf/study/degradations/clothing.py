@@ -132,18 +132,21 @@ def long_hair(keypoints_m: np.ndarray, up: np.ndarray, length_m: float, rng: Rng
     return Garment.tube(middles_m[:, :, None] + head_m * outwards, HAIR)
 
 
-GARMENTS: dict[str, Callable[[np.ndarray, np.ndarray, float, Rng], Garment]] = {"skirt": skirt, "long_hair": long_hair}
-
-
 def add_clothing(
-    kind: str, strength: float, rng: Rng, capture: Capture, body: BodyFit, truth: GroundTruth, out: Path
+    sewn: Callable[[np.ndarray, np.ndarray, float, Rng], Garment],
+    capture: Capture,
+    body: BodyFit,
+    truth: GroundTruth,
+    strength: float,
+    rng: Rng,
+    out: Path,
 ) -> None:
-    """Write the capture into `out` with a garment of GARMENTS drawn into every image and mask, and under
+    """Write the capture into `out` with a garment, `skirt` or `long_hair`, drawn into every image and mask, and under
     `ground_truth/` into the truth. Keypoints stay: detectors guess what cloth hides. Board footage is omitted."""
     bodies_m, faces = body.vertices_m().double().numpy(), body.rig.faces.numpy()
     rows = [body.index(frame) for frame in capture.frames]
     keypoints_m = body.rig.keypoint_weights.double().numpy() @ bodies_m[rows]
-    garment = GARMENTS[kind](keypoints_m, np.eye(3)["xyz".index(capture.up)], strength, rng)
+    garment = sewn(keypoints_m, np.eye(3)["xyz".index(capture.up)], strength, rng)
     kept = dataclasses.replace(capture, root=out, frame_offsets={}, stored_frames=(), recorded_lenses={})
     write_arrays(capture, kept)
     for row, frame in enumerate(capture.frames):

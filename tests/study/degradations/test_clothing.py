@@ -80,11 +80,10 @@ def column(keypoints_m: np.ndarray, up: np.ndarray, half_m: float, rng: np.rando
     return Garment.tube(rings_m, np.ones((2, 3)))
 
 
-def dressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Capture, GroundTruth]:
+def dressed(tmp_path: Path) -> tuple[Capture, GroundTruth]:
     """Draw clothing into the capture of tests/study/recording.py, in which a body of 1 m³ stands before camera 01
     and hides a column 0.5 m thick; the truth is known for the middle 2 x 2 px of camera 03, and is a triangle in
     frame 2."""
-    monkeypatch.setitem(clothing.GARMENTS, "column", column)
     good = write_recording(tmp_path / "good")
     write_detected(good)
     folder = good.root / "ground_truth"
@@ -95,15 +94,15 @@ def dressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Capture, G
     root = torch.eye(4).repeat(len(FRAMES), 1, 1)
     root[:, :3, 3] = torch.tensor([-2.0, -0.5, 0.5])
     body = BodyFit(box_rig(), FRAMES, torch.zeros(len(FRAMES), 2, 3), root)
-    add_clothing("column", 0.25, np.random.default_rng(0), good, body, GroundTruth(good.root, good), tmp_path / "bad")
+    add_clothing(column, good, body, GroundTruth(good.root, good), 0.25, np.random.default_rng(0), tmp_path / "bad")
     bad = Capture.load(tmp_path / "bad")
     return bad, GroundTruth(bad.root, bad)
 
 
-def test_what_is_worn_is_seen_where_the_body_does_not_hide_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_worn_is_seen_where_the_body_does_not_hide_it(tmp_path: Path) -> None:
     """A column 1 m high and 0.5 m wide, 4 m from a camera of 16 px focal length, is about 4 x 2 px around the middle;
     where it is nearest, at 3.75 m, half a metre is 2.13 px."""
-    bad, _ = dressed(tmp_path, monkeypatch)
+    bad, _ = dressed(tmp_path)
     changed = {name: np.abs(bad.image(name, 2).astype(int) - 102).max(-1) > 40 for name in bad.cameras}
     assert not changed["01"].any()
     for name in ("02", "03"):
@@ -118,8 +117,8 @@ def test_what_is_worn_is_seen_where_the_body_does_not_hide_it(tmp_path: Path, mo
     assert bad.background("02").mean() == pytest.approx(50, abs=1)  # type: ignore[union-attr]
 
 
-def test_the_truth_wears_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bad, truth = dressed(tmp_path, monkeypatch)
+def test_the_truth_wears_it_too(tmp_path: Path) -> None:
+    bad, truth = dressed(tmp_path)
     assert (truth.has_mask("03", 2), truth.has_mask("03", 4)) == (True, False)
     assert truth.mask("03", 2)[6:10, 7:9].all()
     assert truth.mask("03", 2).sum() == 8
