@@ -10,7 +10,6 @@ STORE. A result that fails is reported at the end, with exit code 1, and does no
 state of each result and makes none.
 """
 
-import argparse
 import fnmatch
 import os
 import signal
@@ -24,7 +23,7 @@ from pathlib import Path
 
 import torch
 from freshness import code_digest, file_digests, load_records, result_files, save_record, shown_seconds, stale_reason
-from provenance import ROOT, clean_commit, table
+from provenance import ROOT, arguments, clean_commit, table
 from registry import REGISTRY, Result
 from stopwatch import Stopwatch
 
@@ -37,7 +36,7 @@ POLL_S = 0.2  # interval between checks of running programs
 
 def main(argv: list[str] | None = None) -> int:
     """Make or list the chosen results; return 1 if any could not be made."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--store", type=Path, default=ROOT / "store", help="folder of trainings and logs")
     parser.add_argument("--jobs", type=int, choices=(1, 2), default=1, help="programs side by side, one thread each")

@@ -8,13 +8,12 @@ then with twice and half the steps. Everything else stays. Scores a few held-out
 Reuses what is in STORE. Writes `benchmarks/results/budget.json` and `.md`, where other captures keep their results.
 """
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from provenance import RESULTS, SHARED, provenance, provenance_line, table, write_result
+from provenance import RESULTS, SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
 from flows.train_subject import prepare_training
 from hnerf.config import Settings, TrainingSettings, load_settings
@@ -32,10 +31,7 @@ SCORING = ScoringSettings(images=8, meshes=1, snapshot_images=1, snapshot_meshes
 
 def main() -> None:
     """Train and score all variants of all captures, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("store", type=Path)
-    parser.add_argument("captures", nargs="*", default=CAPTURES)
-    options = parser.parse_args()
+    options = store_and_captures(__doc__, CAPTURES)
     where, found = provenance(), RESULTS / "budget.json"
     captures = json.loads(found.read_text())["captures"] if found.exists() else {}
     for name in options.captures:

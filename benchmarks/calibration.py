@@ -12,7 +12,6 @@ frames, must change nothing. Outlines and matches in the images do not depend on
 capture. Needs `../shared` beside this checkout. Writes `benchmarks/results/calibration-faults.json` and `.md`.
 """
 
-import argparse
 import dataclasses
 import tempfile
 import time
@@ -23,7 +22,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
-from provenance import SHARED, provenance, provenance_line, table, write_result
+from provenance import SHARED, arguments, provenance, provenance_line, table, write_result
 
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.matches import Matches
@@ -94,7 +93,7 @@ UNTOUCHED = Fault(0.0)
 
 def main() -> None:
     """Run the trials, print and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("captures", nargs="*", default=list(CAPTURES), metavar="CAPTURE")
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--untouched", type=int, default=20)

@@ -7,7 +7,6 @@ Needs `../shared/data` beside this checkout, and the networks of `hnerf models`.
 """
 
 import dataclasses
-import logging
 import multiprocessing
 import tempfile
 import time
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from peak_memory import peak_mib
-from provenance import SHARED, provenance, provenance_line, table, write_result
+from provenance import SHARED, log_progress, provenance, provenance_line, table, write_result
 
 from hnerf.capture.capture import PERSON, Capture, read_rgb
 from hnerf.capture.ingest import ingest
@@ -46,7 +45,7 @@ PROTOCOL = (
 
 def main() -> None:
     """Detect, measure, print and write."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    log_progress()
     result: dict[str, Any] = provenance() | {"protocol": PROTOCOL, "captures": {}}
     for name in (REAL, *RENDERED):
         with tempfile.TemporaryDirectory() as scratch:

@@ -8,7 +8,6 @@ numbers in each run's masks, body, model and metrics (but seconds); names and la
 ten minutes. Compare two files with `diff`.
 """
 
-import argparse
 import hashlib
 import json
 import os
@@ -22,7 +21,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from provenance import ROOT, SHARED
+from provenance import ROOT, SHARED, arguments
 from safetensors.numpy import load_file
 
 HNERF = Path(sys.executable).with_name("hnerf")
@@ -34,7 +33,7 @@ UNSTABLE = re.compile(r"second|_gib|device|machine|commit|path|protocol")  # dep
 
 def main() -> None:
     """Run all jobs and write their fingerprints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--scratch", type=Path, help="a folder to keep (default: a temporary one)")
     options = parser.parse_args()

@@ -7,7 +7,6 @@ independent program `../shared/accept/score_run.py`; silhouettes of the unclothe
 frame and training camera. Writes `benchmarks/results/fit.json` and `.md`.
 """
 
-import argparse
 import runpy
 import tempfile
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from provenance import SHARED, provenance, provenance_line, table, write_result
+from provenance import SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
 from flows.train_subject import prepare_training, with_detections
 from hnerf.body.fit_result import BodyFit
@@ -40,10 +39,7 @@ COLUMNS = {
 
 def main() -> None:
     """Fit and measure every capture, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("store", type=Path)
-    parser.add_argument("captures", nargs="*", default=CAPTURES, metavar="CAPTURE")
-    options = parser.parse_args()
+    options = store_and_captures(__doc__, CAPTURES)
     where, store = provenance(), Store(options.store.resolve())
     captures = {name: measure(SHARED / "data" / name, store) for name in options.captures}
     result = where | {"captures": captures}

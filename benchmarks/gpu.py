@@ -8,11 +8,10 @@ without Prefect. Writes `OUT/training/`, `OUT/evaluation/` and, under `benchmark
 and `.md`.
 """
 
-import argparse
 from pathlib import Path
 
 import torch
-from provenance import provenance, provenance_line, table, write_result
+from provenance import arguments, provenance, provenance_line, table, write_result
 from score_shared import GEOMETRY_COLUMNS, IMAGE_COLUMNS, score_cells
 
 from hnerf.avatar.trained import load_avatar
@@ -31,7 +30,7 @@ SIDES_PX = (256, 512)
 
 def main() -> None:
     """Train, evaluate, render and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     for name in ("subject", "capture", "out"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--preset", default="fast")

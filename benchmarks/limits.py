@@ -8,7 +8,6 @@ trained anew, with the same seed, and scored on held-out images. Reuses what is 
 `benchmarks/results/limits.json` and `.md`.
 """
 
-import argparse
 import json
 import shutil
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from fit import joint_errors
-from provenance import SHARED, provenance, provenance_line, table, write_result
+from provenance import SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
 from flows.train_subject import prepare_training, with_detections
 from hnerf.capture.capture import Capture
@@ -39,10 +38,7 @@ BODY_25 = 25  # keypoints, the first of the true ones
 
 def main() -> None:
     """Measure all captures, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("store", type=Path)
-    parser.add_argument("captures", nargs="*", default=CAPTURES, metavar="CAPTURE")
-    options = parser.parse_args()
+    options = store_and_captures(__doc__, CAPTURES)
     result: dict[str, Any] = provenance() | {"captures": {}}
     for name in options.captures:
         rows = result["captures"][name] = {}

@@ -7,7 +7,6 @@ Needs `../shared` beside this checkout and the networks of `hnerf models`, whose
 """
 
 import dataclasses
-import logging
 import tempfile
 import time
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from provenance import SHARED, provenance, provenance_line, table, write_result
+from provenance import SHARED, log_progress, provenance, provenance_line, table, write_result
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.rig import pose_vertices
@@ -58,7 +57,7 @@ PROTOCOL = (
 
 def main() -> None:
     """Measure, print and write."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    log_progress()
     result: dict[str, Any] = provenance() | {"protocol": PROTOCOL, "captures": {}}
     for name in (REAL, *RENDERED):
         with tempfile.TemporaryDirectory() as scratch:

@@ -1,8 +1,12 @@
-"""Provenance of results, machine, commit and date, and how results are written."""
+"""What programs share: their arguments, the provenance of results, machine, commit and date, and how they are
+written."""
 
+import argparse
 import json
+import logging
 import subprocess
 import sys
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,6 +19,24 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 SHARED = ROOT.parent / "shared"
 REFUSED = 2
+
+
+def arguments(doc: str | None) -> argparse.ArgumentParser:
+    """Return the parser of a program, which shows its docstring."""
+    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def store_and_captures(doc: str | None, captures: Sequence[str]) -> argparse.Namespace:
+    """Return the arguments STORE and, by default these, CAPTURE ... of a program."""
+    parser = arguments(doc)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("captures", nargs="*", default=captures, metavar="CAPTURE")
+    return parser.parse_args()
+
+
+def log_progress() -> None:
+    """Show what the package logs, with the time."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
 
 
 def provenance() -> dict[str, Any]:

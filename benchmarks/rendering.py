@@ -8,11 +8,10 @@ longest side is 256 and 512 px; on a GPU if there is one. Reports medians. Run i
 `benchmarks/results/rendering.json` and `.md`.
 """
 
-import argparse
 from pathlib import Path
 
 import torch
-from provenance import SHARED, provenance, provenance_line, table, write_result
+from provenance import SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
 from flows.train_subject import train_subject
 from hnerf.avatar.trained import load_avatar
@@ -26,10 +25,7 @@ SIDES_PX = (256, 512)
 
 def main() -> None:
     """Train, render, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("store", type=Path)
-    parser.add_argument("captures", nargs="*", default=CAPTURES, metavar="CAPTURE")
-    options = parser.parse_args()
+    options = store_and_captures(__doc__, CAPTURES)
     result = provenance()
     threads = result["machine"]["threads"]
     cores = [threads] if torch.cuda.is_available() else sorted({1, threads})

@@ -8,7 +8,6 @@ its frames, cameras and pixels in turn, in a new store. Writes `benchmarks/resul
 straight lines of the chart mark proportional cost.
 """
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from peak_memory import peak_mib, reset_peak
-from provenance import RESULTS, provenance, provenance_line, table, write_result
+from provenance import RESULTS, arguments, provenance, provenance_line, table, write_result
 from studies import capture_folder
 
 from flows.train_subject import segment_subject
@@ -41,7 +40,7 @@ Cost = tuple[float, float]  # seconds, GiB
 
 def main() -> None:
     """Measure all parts, print, draw and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("name")
     parser.add_argument("capture")
     parser.add_argument("--synth", action="append", default=[], metavar="a=b", help="of the performer")

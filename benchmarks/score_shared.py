@@ -9,7 +9,6 @@ again; for a subject that the store knows, the time of the whole run is therefor
 a copy of each capture that lacks this folder.
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -21,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from provenance import ROOT, SHARED, provenance, provenance_line, table, write_result
+from provenance import ROOT, SHARED, arguments, provenance, provenance_line, table, write_result
 
 from hnerf.evaluation.views import NOVEL_POSE_SPLITS
 from tasks.launcher import end_with_parent
@@ -39,7 +38,7 @@ GEOMETRY_COLUMNS = {
 
 def main() -> int:
     """Score all captures, print and write; return 1 if any failed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("captures", nargs="*", default=list(CAPTURES), metavar="CAPTURE")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--store", type=Path, default=ROOT / "store")

@@ -7,9 +7,7 @@ training cameras are segmented and scored. `--sheet` also writes a picture for e
 ones cyan, worst frames first. Writes `benchmarks/results/segmentation.json` and `.md`.
 """
 
-import argparse
 import itertools
-import logging
 import shutil
 import tempfile
 import time
@@ -18,7 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from provenance import SHARED, provenance, provenance_line, table, write_result
+from provenance import SHARED, arguments, log_progress, provenance, provenance_line, table, write_result
 
 from hnerf.body.fit import fit_body
 from hnerf.body.fit_result import BodyFit
@@ -42,11 +40,11 @@ PROTOCOL = (
 
 def main() -> None:
     """Segment, score, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("captures", nargs="*", default=list(CAPTURES), metavar="CAPTURE")
     parser.add_argument("--sheet", type=Path, help="folder for pictures")
     options = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    log_progress()
     result: dict[str, Any] = provenance() | {"protocol": PROTOCOL, "captures": {}}
     for name in options.captures:
         result["captures"][name] = measure(SHARED / "data" / name, options.sheet)

@@ -5,11 +5,10 @@ usage: python benchmarks/soak.py [--subjects 50] [--kill-every 180]
 What happens, and what counts as a fault: tests/soak.py. Writes `benchmarks/results/soak.json` and `.md`.
 """
 
-import argparse
 import sys
 from pathlib import Path
 
-from provenance import provenance, provenance_line, table, write_result
+from provenance import arguments, provenance, provenance_line, table, write_result
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -18,7 +17,7 @@ from tests.soak import under_fire
 
 def main() -> None:
     """Train, kill, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("--subjects", type=int, default=50)
     parser.add_argument("--kill-every", type=float, default=180.0, metavar="S")
     options = parser.parse_args()

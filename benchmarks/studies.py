@@ -11,11 +11,10 @@ copies its tables and charts to `benchmarks/results/<kind>/`, without the `-part
 seconds. Ablations are scored on a few images.
 """
 
-import argparse
 import shutil
 from pathlib import Path
 
-from provenance import RESULTS, ROOT, SHARED, clean_commit, provenance, provenance_line
+from provenance import RESULTS, ROOT, SHARED, arguments, clean_commit, provenance, provenance_line
 
 from flows.ablations import ablate
 from flows.benchmark import benchmark
@@ -29,7 +28,7 @@ FEW = ["evaluation.max_images=8", "evaluation.max_meshes=2", "evaluation.report_
 
 def main() -> None:
     """Run one study, copy its files and add their provenance."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("store", type=Path)
     parser.add_argument("capture")
     parser.add_argument("kind", choices=["benchmark", "stability", "ablations"])
