@@ -28,14 +28,13 @@ def baked_textures(
     surfaces_m: np.ndarray,
     layout: UvLayout,
     settings: AssetSettings,
-    cavities: np.ndarray | None = None,
+    cavities: np.ndarray,
 ) -> tuple[np.ndarray, Albedo | None]:
     """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, and its albedo, unless it is the field's alone.
     surfaces_m (n, V, 3): its surface in the world in each frame; cavities (V,) bool: vertices deep inside mouth
     and nose, which are as dark as places that little light gets to."""
     texels, faces = rasterise(layout, settings.texture_px), clothed.rig.faces.numpy()
-    outer = np.ones(len(clothed.rig.vertices_m)) if cavities is None else ~cavities
-    lit = texels.interpolate(np.where(outer, 1.0, CAVITY_BRIGHTNESS)[:, None], faces)
+    lit = texels.interpolate(np.where(cavities, CAVITY_BRIGHTNESS, 1.0)[:, None], faces)
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
     if not settings.photograph_frames:
         field = field_colours(avatar, posed, texels, cavities)
@@ -60,7 +59,7 @@ def baked_textures(
 
 
 def _coarse_field_colours(
-    avatar: Avatar, posed: BodyFit, layout: UvLayout, texels: Texels, texture_px: int, cavities: np.ndarray | None
+    avatar: Avatar, posed: BodyFit, layout: UvLayout, texels: Texels, texture_px: int, cavities: np.ndarray
 ) -> np.ndarray:
     """Return the field's colours at texels of a texture, (N, 3), from those of a smaller one."""
     side_px = min(texture_px, max(FIELD_PX, texture_px // 2))  # no smaller: charts lie a few texels apart

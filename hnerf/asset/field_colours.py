@@ -24,7 +24,7 @@ log = logging.getLogger("hnerf.asset")
 
 
 @torch.no_grad()
-def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels, cavities: np.ndarray | None = None) -> np.ndarray:
+def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels, cavities: np.ndarray) -> np.ndarray:
     """Return the field's colour at each texel, (N, 3): its radiance along the inward normal, the median over the poses
     of `clothed`.
 
@@ -32,9 +32,7 @@ def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels, cavities: np
     that spot touches another limb. A texel that lies off the field's surface in all poses takes the colour of the mesh
     around it, and so do vertices that line cavities, (V,) bool, of which the field has no surface.
     """
-    seen, outer = [], torch.ones(len(clothed.rig.vertices_m), dtype=torch.bool)
-    if cavities is not None:
-        outer = ~torch.from_numpy(cavities)
+    seen, outer = [], ~torch.from_numpy(cavities)
     for frame, theta, root in zip(clothed.frames, clothed.theta, clothed.root, strict=True):
         log.info("texture: %d texels in the pose of frame %d", len(texels.face), frame)
         seen.append(_colours_in_pose(avatar, clothed.rig, texels, theta, root, outer).numpy())

@@ -61,6 +61,11 @@ def posed_with_displacements(clothed: BodyFit, moved_m: np.ndarray) -> np.ndarra
     return np.stack([pose_vertices(rig, theta, root).numpy() for rig, theta, root in posed])
 
 
+def no_cavities(clothed: BodyFit) -> np.ndarray:
+    """Return that no vertex lines a cavity."""
+    return np.zeros(len(clothed.rig.vertices_m), bool)
+
+
 def side_camera() -> Camera:
     """Return a camera 3 m from the origin along -y of the world, looking along +y; the image's right is +x."""
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])

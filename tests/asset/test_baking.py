@@ -65,7 +65,7 @@ def test_the_albedo_of_a_grey_column_is_one_grey(pictures: dict[int, np.ndarray]
     surfaces_m = figure.posed_with_displacements(body, still_m).astype(float)
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
-    texture, albedo = baked_textures(capture, Grey(body), body, surfaces_m, layout, SETTINGS)
+    texture, albedo = baked_textures(capture, Grey(body), body, surfaces_m, layout, SETTINGS, figure.no_cavities(body))
     assert albedo is not None
     light = albedo.light.coefficients / albedo.light.coefficients[0]
     np.testing.assert_allclose(light, SUN.coefficients / 0.7, atol=0.03)
@@ -78,7 +78,9 @@ def test_there_is_no_albedo_without_photographs() -> None:
     body = figure.bending_body()
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     settings = SETTINGS.model_copy(update={"photograph_frames": 0})
-    texture, albedo = baked_textures(figure.capture(), Grey(body), body, np.zeros(0), layout, settings)
+    texture, albedo = baked_textures(
+        figure.capture(), Grey(body), body, np.zeros(0), layout, settings, figure.no_cavities(body)
+    )
     assert albedo is None and texture.shape == (64, 64, 3)
 
 
@@ -94,7 +96,7 @@ def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
     z_m = vertices_m[faces[texels.face.numpy()]][..., 2]
     for photographs in (0, 3):
         settings, shown = SETTINGS.model_copy(update={"photograph_frames": photographs}), []
-        for cavities in (None, vertices_m[:, 2] > 0.85):
+        for cavities in (figure.no_cavities(body), vertices_m[:, 2] > 0.85):
             texture, _ = baked_textures(capture, Grey(body), body, surfaces_m, layout, settings, cavities)
             shown.append(texture[texels.row, texels.column, 0].astype(float))
         ratio = shown[1] / shown[0]

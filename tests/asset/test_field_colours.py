@@ -9,7 +9,7 @@ from hnerf.asset.field_colours import field_colours, filled, median_of_seen
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.texture import Texels, rasterise, texture_image, unwrap
 from hnerf.body.fit_result import BodyFit
-from tests.asset.figure import bending_body, column_rig, twice, upright_column
+from tests.asset.figure import bending_body, column_rig, no_cavities, twice, upright_column
 from tests.asset.stand_in import StandInAvatar, rest_colour
 
 
@@ -25,7 +25,7 @@ def test_colours_are_read_on_the_fields_own_surface() -> None:
     clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far inside
     layout = unwrap(clothes.vertices, clothes.faces, 64)
     posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
-    field_colours(Recording(body), posed, rasterise(layout, 64))
+    field_colours(Recording(body), posed, rasterise(layout, 64), no_cavities(posed))
     assert len(read_m) == len(body.frames)
     for distance_m in read_m:
         assert distance_m.abs().median() < 0.002
@@ -37,7 +37,8 @@ def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
     layout = unwrap(clothes.vertices, clothes.faces, 256)
     rig = clothed_rig(body.rig, clothes)
     texels = rasterise(layout, 256)
-    colours = field_colours(StandInAvatar(body), dataclasses.replace(body, rig=rig), texels)
+    posed = dataclasses.replace(body, rig=rig)
+    colours = field_colours(StandInAvatar(body), posed, texels, no_cavities(posed))
     image = texture_image(texels, colours, 256)
     middle_uv = layout.uvs[layout.face_uvs].mean(1)
     pixel = image[((1 - middle_uv[:, 1]) * 256).astype(int), (middle_uv[:, 0] * 256).astype(int)]
@@ -61,7 +62,8 @@ def test_texels_off_the_fields_surface_take_the_colour_around() -> None:
     body = BodyFit(column_rig(), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
     clothes = upright_column(0.16, 0.0, 1.85)
     texels = rasterise(unwrap(clothes.vertices, clothes.faces, 64), 64)
-    colours = field_colours(Height(body), dataclasses.replace(body, rig=clothed_rig(body.rig, clothes)), texels)
+    posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    colours = field_colours(Height(body), posed, texels, no_cavities(posed))
     z_m = clothes.triangles_center[texels.face.numpy(), 2]
     assert colours[z_m > 1.7].max() < 0.83
     assert colours[z_m > 1.7].min() > 0.7
@@ -79,7 +81,7 @@ def test_cavities_take_the_colour_around() -> None:
     texels = rasterise(unwrap(clothes.vertices, clothes.faces, 64), 64)
     posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
     z_m = clothes.triangles_center[texels.face.numpy(), 2]
-    for cavities, above in ((None, [0, 1, 0]), (clothes.vertices[:, 2] > 0.75, [1, 0, 0])):
+    for cavities, above in ((no_cavities(posed), [0, 1, 0]), (clothes.vertices[:, 2] > 0.75, [1, 0, 0])):
         colours = field_colours(Halves(body), posed, texels, cavities)
         np.testing.assert_allclose(np.median(colours[z_m > 0.9], 0), above, atol=1e-3)
         np.testing.assert_allclose(np.median(colours[z_m < 0.7], 0), [1, 0, 0], atol=1e-3)
