@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 
 from hnerf.config import Section, validated
 from hnerf.errors import InputError, PlaceError
-from tasks.store import Artifact, Store, remove
+from tasks.store import NAME, Artifact, SizeBytes, Store, remove
 
 MANIFEST = re.compile(r"[0-9a-f]{64}\.json")
 MAX_MANIFEST_BYTES = 64 << 20  # 200 bytes a file
@@ -28,8 +28,7 @@ CHUNK_BYTES = 1 << 20
 MAX_PATH_BYTES, MAX_NAME_BYTES = 1024, 255  # the latter of a folder or file
 SPARE_BYTES = 1 << 30  # of the disk, which an archive must leave free
 
-Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z-]{0,30}/[0-9a-f]{32}$")]  # of an artifact
+Name = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
 
 class NoRoomError(PlaceError):
@@ -39,8 +38,8 @@ class NoRoomError(PlaceError):
 class ArchivedFile(Section):
     """The digest and size of a file."""
 
-    sha256: Digest
-    size_bytes: int = Field(ge=0)
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    size_bytes: SizeBytes
 
 
 class ArchivedArtifact(Section):

@@ -22,14 +22,16 @@ import json
 import logging
 import math
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field, FiniteFloat
 
 from hnerf.errors import InputError
 from hnerf.files import made_folder, replace_text
@@ -43,12 +45,15 @@ ATTEMPTS = 100  # to lock a key in a folder that others make and remove
 # In order: each stage is computed from those before it.
 STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
 
+NAME = re.compile(r"[a-z][a-z-]{0,30}/[0-9a-f]{32}")  # of an artifact
+SizeBytes = Annotated[int, Field(ge=0, lt=2**63)]  # of a file
+
 
 class StoredFile(BaseModel):
     """The digest and size by which a file of an artifact is checked."""
 
     sha256: str
-    size_bytes: int
+    size_bytes: SizeBytes
 
 
 class Artifact(BaseModel):
@@ -58,7 +63,7 @@ class Artifact(BaseModel):
     stage: str
     root: Path
     files: dict[str, StoredFile]
-    metrics: dict[str, float] = {}
+    metrics: dict[str, FiniteFloat] = {}
     inputs: tuple[str, ...] = ()
 
     @property
@@ -119,7 +124,8 @@ class Store:
             artifact = Artifact.model_validate({"root": root, **json.loads(record.read_bytes())})
         except (RecursionError, TypeError, ValueError):  # TypeError: JSON, but no object
             return None
-        return artifact if artifact.stage == stage else None
+        named = all(NAME.fullmatch(name) for name in artifact.inputs)
+        return artifact if named and artifact.stage == stage else None
 
     def get_or_compute(
         self,

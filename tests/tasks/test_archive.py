@@ -142,6 +142,7 @@ def test_paths_that_lead_out_are_refused(packed: Path, tmp_path: Path, path: str
         lambda m: m["artifacts"].update({"../fit": m["artifacts"][NAME]}),
         lambda m: m["artifacts"][NAME].update(inputs=["../x"]),
         lambda m: m["artifacts"][NAME]["files"]["deep/letters"].update(size_bytes=-1),
+        lambda m: m["artifacts"][NAME]["files"]["deep/letters"].update(size_bytes=10**400),
         lambda m: m["artifacts"][NAME]["files"]["deep/letters"].update(sha256="../" * 20),
         lambda m: m["artifacts"][NAME]["files"]["deep/letters"].update(size_bytes=1 << 60),
         lambda m: m["artifacts"][NAME]["files"].update(more={"sha256": "0" * 64, "size_bytes": 1}),
