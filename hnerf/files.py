@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from uuid import uuid4
 
 from hnerf.errors import InputError
 
@@ -42,11 +43,13 @@ def made_folder(folder: Path) -> Iterator[None]:
 def replace_text(path: Path, text: str) -> None:
     """Replace a text file atomically: write a temporary file beside it, then rename."""
     encoded = text.encode()
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    beside.unlink(missing_ok=True)
-    with beside.open("xb") as file:  # never through a link that lies there
-        file.write(encoded)
-    os.replace(beside, path)
+    beside = path.with_name(f".{uuid4().hex}")
+    try:
+        with beside.open("xb") as file:  # never through a link that lies there
+            file.write(encoded)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
 
 
 def markdown_image(name: str) -> str:

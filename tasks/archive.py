@@ -44,7 +44,7 @@ def export_subject(store: Store, subject: str, out: Path) -> Manifest:
     manifest = Manifest(
         subject=subject, recording=store.recording(subject), latest=latest, artifacts=archived(artifacts)
     )
-    beside = out.with_name(f".{out.name}.{os.getpid()}")
+    beside = out.with_name(f".{uuid4().hex}")
     try:
         pack(manifest, store, beside)
         os.replace(beside, out)

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Annotated
+from uuid import uuid4
 
 from pydantic import BaseModel, Field, FiniteFloat
 
@@ -181,8 +182,7 @@ class Store:
         if link.is_symlink():  # what was computed from an earlier artifact no longer belongs to the subject
             for stage in STAGES[STAGES.index(artifact.stage) + 1 :]:
                 (link.parent / stage).unlink(missing_ok=True)
-        beside = link.with_name(f".{artifact.stage}.{os.getpid()}")
-        beside.unlink(missing_ok=True)
+        beside = link.with_name(f".{uuid4().hex}")
         beside.symlink_to(target)
         os.replace(beside, link)
         return artifact

@@ -1,9 +1,11 @@
+import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from hnerf.errors import InputError
-from hnerf.files import atomic_folder, made_folder
+from hnerf.files import atomic_folder, made_folder, replace_text
 
 
 def test_it_takes_its_name_when_all_is_written(tmp_path: Path) -> None:
@@ -42,3 +44,24 @@ def test_folders_that_stay_empty_go_again_and_others_stay(tmp_path: Path) -> Non
     with made_folder(tmp_path / "there"), made_folder(tmp_path / "a" / "b"), made_folder(tmp_path / "c"):
         (tmp_path / "c" / "new").touch()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c", "there"]
+
+
+def test_two_with_one_process_number_replace_a_text_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are in containers that share a folder."""
+
+    def replaced(*ends: Path) -> None:
+        monkeypatch.setattr(os, "replace", replace)
+        replace_text(tmp_path / "note", "theirs")
+        replace(*ends)
+
+    replace = os.replace
+    monkeypatch.setattr(os, "replace", replaced)
+    replace_text(tmp_path / "note", "mine")
+    assert [path.name for path in tmp_path.iterdir()] == ["note"] and (tmp_path / "note").read_text() == "mine"
+
+
+def test_a_text_that_cannot_be_replaced_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "replace", Mock(side_effect=OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        replace_text(tmp_path / "note", "mine")
+    assert list(tmp_path.iterdir()) == []

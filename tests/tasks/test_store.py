@@ -302,6 +302,21 @@ def test_view_points_at_the_latest(tmp_path: Path) -> None:
     assert list(link.parent.iterdir()) == [link]
 
 
+def test_two_with_one_process_number_link_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are in containers that share a store."""
+
+    def replaced(*ends: Path) -> None:
+        monkeypatch.setattr(os, "replace", replace)
+        store.link_latest("ada", theirs)
+        replace(*ends)
+
+    store, replace = Store(tmp_path), os.replace
+    mine, theirs = (store.get_or_compute("fit", key, write_abc) for key in ("mine", "theirs"))
+    monkeypatch.setattr(os, "replace", replaced)
+    store.link_latest("ada", mine)
+    assert os.readlink(tmp_path / "subjects" / "ada" / "fit") == "../../fit/mine"
+
+
 def test_hands_of_another_recording_replace_those_before(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("hands", "fit"):
