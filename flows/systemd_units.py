@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from hnerf.errors import InputError
+
 ROOT = Path(__file__).parents[1]
 FOREVER = "Restart=always\nRestartSec=10"
 
@@ -39,8 +41,10 @@ WantedBy=default.target
 
 
 def _escaped(path: Path) -> str:
-    """Return a path in which systemd replaces nothing."""
-    return str(path).replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    """Return a path in which systemd replaces nothing. Raises InputError where it could not be written so."""
+    if '"' in str(path) or "\\" in str(path):
+        raise InputError(f'{path}: systemd takes no path with " or \\; move the checkout')
+    return str(path).replace("%", "%%")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -50,7 +54,11 @@ def main(argv: list[str] | None = None) -> None:
     folder = parser.parse_args(argv).folder
     if not folder.is_dir():
         parser.exit(2, f"{folder}: no such folder; make it first\n")
-    for name, text in units(ROOT).items():
+    try:
+        texts = units(ROOT)
+    except InputError as error:
+        parser.exit(2, f"{error}\n")
+    for name, text in texts.items():
         (folder / name).write_text(text)
 
 

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from flows import systemd_units as module
 from flows.systemd_units import main, units
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 def test_systemd_accepts_the_units(tmp_path: Path) -> None:
-    root = tmp_path / "a checkout of 100%"
+    root = tmp_path / "a checkout of 100% for $HOME"
     (root / ".venv" / "bin").mkdir(parents=True)
     (root / ".venv" / "bin" / "prefect").touch(mode=0o755)
     paths = []
@@ -26,6 +27,17 @@ def test_both_come_back_whatever_ends_them() -> None:
     for text in units(Path("/srv/hnerf")).values():
         assert "Restart=always" in text and "StartLimitIntervalSec=0" in text
     assert "Wants=hnerf-server.service" in units(Path("/srv/hnerf"))["hnerf-worker.service"]
+
+
+@pytest.mark.parametrize("name", ['a"b', "a\\b"])
+def test_a_path_that_systemd_does_not_take_is_one_line(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "ROOT", Path("/srv") / name)
+    with pytest.raises(SystemExit, match="2"):
+        main([str(tmp_path)])
+    assert capsys.readouterr().err == f'/srv/{name}: systemd takes no path with " or \\; move the checkout\n'
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_they_are_written_into_a_folder_that_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
