@@ -197,8 +197,8 @@ def evaluate_without_camera(
     others = tuple(name for name in calibrated_capture(recording, calibration).train_cameras if name != camera)
     prepared = segment_and_fit(store, subset_capture(store, recording, others, None, None), calibration, settings)
     training = train(store, *prepared, settings.training)
-    scored = settings.evaluation.model_copy(update={"holdout": camera})  # also if the setting is "each"
-    return evaluate_held_out(store, recording, calibration, segmentation, prepared.body, training, scored)
+    scored = (recording, calibration, segmentation, prepared.body, training)
+    return evaluate_held_out(store, *scored, camera, settings.evaluation)
 
 
 def segment_subject(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:

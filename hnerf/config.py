@@ -23,9 +23,17 @@ CLOSE = 0.7  # of difflib: keys that are taken for misspelled ones
 
 
 class Section(BaseModel):
-    """Settings of one stage: frozen, without unknown keys or values outside their type."""
+    """Settings of one stage: frozen, without unknown keys or values outside their type.
 
+    beside_the_result: names of those on which the stage's result does not depend.
+    """
+
+    beside_the_result: ClassVar[tuple[str, ...]] = ()
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    def deciding(self) -> dict[str, Any]:
+        """Return the settings on which the stage's result depends."""
+        return self.model_dump(exclude=set(self.beside_the_result))
 
 
 class CaptureSettings(Section):
@@ -69,6 +77,7 @@ class CalibrationSettings(Section):
 class SegmentationSettings(Section):
     """Settings of the masks."""
 
+    beside_the_result: ClassVar[tuple[str, ...]] = ("rounds", "still_px")  # of the flow, which repeats the stage
     shadow_chroma: float = Field(default=0.01, gt=0)  # std of log colour ratios in a shadow, beyond noise
     darkest_shadow: float = Field(default=0.3, gt=0, lt=1)  # share of the brightness that is left in the deepest shadow
     reach: float = Field(default=0.13, gt=0)  # of clothes and hair from limbs, in heights of the person
@@ -236,6 +245,7 @@ AnyFieldSettings = (
 class TrainingSettings(Section):
     """Settings of training: the field with its own settings, the losses and the optimisation."""
 
+    beside_the_result: ClassVar[tuple[str, ...]] = ("processes", "memory_gib")  # but for the order of sums
     field: AnyFieldSettings = Field(default=FastFieldSettings(), discriminator="kind")
     losses: LossSettings = LossSettings()
     steps: int = Field(default=0, ge=0)  # 0: chosen from the scene
@@ -270,6 +280,7 @@ class TrainingSettings(Section):
 class EvaluationSettings(Section):
     """Settings of the evaluation and its report."""
 
+    beside_the_result: ClassVar[tuple[str, ...]] = ("holdout",)  # of the flow, which names the camera to the stage
     max_meshes: int = Field(default=4, ge=1)  # per split
     max_images: int | None = Field(default=None, ge=1)  # per split; None: all
     report_rows: int = Field(default=3, ge=1)  # frames shown of each split

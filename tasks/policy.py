@@ -48,8 +48,8 @@ def _key_value(value: Input | int) -> Any:
     if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, Section):
-        return value.model_dump()
-    if isinstance(value, Source):
+        return value.deciding()
+    if isinstance(value, Source) and not value.is_truth:  # a person may be called as the folder is
         return [value.name, value.digest]
     return value.digest
 

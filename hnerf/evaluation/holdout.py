@@ -51,17 +51,15 @@ def score_held_out(
     avatar: Avatar,
     fitted: BodyFit,
     training: Path,
+    camera: str,
     settings: EvaluationSettings,
     out: Path,
 ) -> HeldOutCamera:
-    """Write `holdout.json`, the scores of the camera `settings.holdout`, and `renders/` into `out`; return what
-    holdout.json holds.
+    """Write `holdout.json`, the scores of a camera, and `renders/` into `out`; return what holdout.json holds.
 
     capture, masks: with that camera; avatar, fitted, training: the field, the body and the training folder that were
     made without it.
     """
-    camera = settings.holdout
-    assert camera is not None
     others = tuple(name for name in capture.train_cameras if name != camera)
     seen = dataclasses.replace(capture, train_cameras=others, test_cameras=(camera,))
     truth = OwnMasks(seen, masks)

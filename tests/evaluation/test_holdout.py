@@ -56,8 +56,8 @@ def held_out(base: Path, capture: Capture, camera: str) -> tuple[Path, dict[str,
     write_settings(training)
     fit = ball_fit()
     avatar = BallAvatar(tuned(fit), RENDERED, frames_darken_by=51)
-    settings = EvaluationSettings(holdout=camera)
-    return out, score_held_out(capture, Masks(masks, {}), avatar, fit, training, settings, out)
+    scores = score_held_out(capture, Masks(masks, {}), avatar, fit, training, camera, EvaluationSettings(), out)
+    return out, scores
 
 
 def psnr_db(capture: Capture, camera: str, frame: int, grey: int) -> float:

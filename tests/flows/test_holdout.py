@@ -93,7 +93,7 @@ def test_a_camera_left_out_is_scored_with_the_masks_of_the_whole_run(
 ) -> None:
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", ["evaluation.holdout='02'"])
     (scored,), (whole, left) = of(calls, "holdout"), of(calls, "training")
-    assert scored["settings"].holdout == "02"
+    assert scored["camera"] == "02"
     assert scored["recording"].stage == "capture" and scored["segmentation"] == whole["segmentation"]
     assert scored["body"] == left["body"] and scored["body"] != whole["body"]
     (report,) = of(calls, "evaluation")
@@ -102,7 +102,7 @@ def test_a_camera_left_out_is_scored_with_the_masks_of_the_whole_run(
 
 def test_each_camera_is_left_out_once_and_found_again(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", HELD_OUT)
-    assert [call["settings"].holdout for call in of(calls, "holdout")] == list(CAMERAS)
+    assert [call["camera"] for call in of(calls, "holdout")] == list(CAMERAS)
     assert len(of(calls, "training")) == 4
     done = len(calls)
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", HELD_OUT)

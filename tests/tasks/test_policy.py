@@ -5,7 +5,14 @@ from typing import Any
 import pytest
 from prefect.states import Failed
 
-from hnerf.config import CaptureSettings, FitSettings, Section, SegmentationSettings
+from hnerf.config import (
+    CaptureSettings,
+    EvaluationSettings,
+    FitSettings,
+    Section,
+    SegmentationSettings,
+    TrainingSettings,
+)
 from hnerf.errors import InputError
 from tasks.launcher import LostWorkerError
 from tasks.policy import is_transient, stage_key
@@ -55,6 +62,22 @@ def test_key_is_the_same_wherever_the_bytes_lie(same: dict[str, Any]) -> None:
 )
 def test_key_changes_with_name_version_bytes_and_settings(other: dict[str, Any]) -> None:
     assert key(**other) != key()
+
+
+def test_settings_that_leave_the_result_as_it_is_do_not_count() -> None:
+    """Raising the limit on memory, say, must not train again."""
+    for one, other in (
+        (TrainingSettings(), TrainingSettings(memory_gib=8, processes=2)),
+        (EvaluationSettings(), EvaluationSettings(holdout="each")),
+        (SegmentationSettings(), SegmentationSettings(rounds=9, still_px=1)),
+    ):
+        assert key(settings=one) == key(settings=other) and one != other
+    assert key(settings=TrainingSettings()) != key(settings=TrainingSettings(steps=2))
+
+
+def test_the_folder_of_a_ground_truth_does_not_count() -> None:
+    ada, bob = (source(name=name).model_copy(update={"is_truth": True}) for name in ("ada", "bob"))
+    assert key(truth=ada) == key(truth=bob) != key(truth=bob.model_copy(update={"digest": "e"}))
 
 
 def test_a_file_that_a_setting_names_counts_by_its_bytes(tmp_path: Path) -> None:
