@@ -172,7 +172,7 @@ def test_a_checkpoint_without_the_snapshots_before_it_is_discarded(
     settings = tiny(snapshots_s=[1e-6, 1e6], steps=2, novel_pose_steps=0)
     train(*recording, settings, tmp_path, ALONE)
     train(*recording, settings, tmp_path, ALONE)
-    assert caplog.text == ""
+    assert "starts again" not in caplog.text
     snapshot.rename(tmp_path / "elsewhere")
     train(*recording, settings, tmp_path, ALONE)
     assert "snapshots/1e-06: not there, though the checkpoint is later; the training starts again" in caplog.text
