@@ -1,3 +1,4 @@
+import errno
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
@@ -46,6 +47,23 @@ def test_objects_are_made_read_replaced_and_removed(tmp_path: Path) -> None:
     assert bucket.size_bytes("a/b") is None
     with pytest.raises(FileNotFoundError):
         bucket.download("a/b", tmp_path / "there")
+
+
+def test_an_upload_that_ends_half_way_leaves_the_object_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(fs: object, path: str, where: str) -> None:
+        Path(where).write_text(Path(path).read_text()[:1])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    bucket = Bucket.at(f"file://{tmp_path}")
+    for text in ("old", "new"):
+        (tmp_path / text).write_text(text)
+    bucket.upload(tmp_path / "old", "a/b")
+    monkeypatch.setattr(type(bucket.fs), "put_file", half)
+    with pytest.raises(BucketError, match="No space left"):
+        bucket.upload(tmp_path / "new", "a/b")
+    assert (tmp_path / "a" / "b").read_text() == "old"
 
 
 @pytest.mark.parametrize("kind", ["file", "s3"])

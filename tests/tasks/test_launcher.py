@@ -61,6 +61,13 @@ def test_ranks_log_lines_report_progress_and_import_nothing_from_where_the_user_
     assert sorted(progress) == [("training", 0, 8), ("training", 1, 8)]
 
 
+def test_threads_of_ranks_sleep_while_they_wait_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    assert launcher._environment(2)["OMP_WAIT_POLICY"] == "PASSIVE"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    assert launcher._environment(2)["OMP_WAIT_POLICY"] == "ACTIVE"
+
+
 def test_lines_are_logged_as_they_come(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

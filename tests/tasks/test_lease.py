@@ -47,6 +47,22 @@ def test_one_who_lives_is_waited_for(bucket: Bucket) -> None:
     assert notes(bucket) == []
 
 
+def test_the_owner_keeps_showing_that_it_lives(bucket: Bucket) -> None:
+    seen = set()
+    with leased(bucket, NAME):
+        for _ in range(30):
+            seen.add(bucket.read_note(f"{NAME}.lease.0"))
+            time.sleep(0.02)
+    assert len(seen - {b"", None}) > 2  # a file is empty while it is written
+
+
+def test_who_waits_sees_that_another_took_over(bucket: Bucket) -> None:
+    """The first owner is silent, but it is the second one's turn that counts now."""
+    for turn in (0, 1):
+        bucket.create_note(f"{NAME}.lease.{turn}", b"gone:1 5")
+    assert not lease._expires(bucket, NAME, 0, b"gone:1 5")
+
+
 def test_of_many_one_takes_over_from_one_who_died(bucket: Bucket) -> None:
     bucket.create_note(f"{NAME}.lease.0", b"gone:1 5")
     together, held = Barrier(8), list[float]()

@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -128,6 +129,23 @@ def test_nothing_is_fetched_that_would_fill_the_disk(tmp_path: Path, monkeypatch
     monkeypatch.setattr(packed, "SPARE_BYTES", 1 << 60)
     with pytest.raises(InputError, match="make room"):
         made(bucket, Store(tmp_path / "there"))
+
+
+def test_nothing_is_unpacked_that_would_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The object holds once what is unpacked fifty times."""
+
+    def many(out: Path) -> dict[str, float]:
+        for number in range(50):
+            (out / str(number)).write_bytes(bytes(10_000))
+        return {}
+
+    bucket = disk_bucket(tmp_path)
+    made(bucket, Store(tmp_path / "here"), many)
+    free = packed.SPARE_BYTES + 100_000
+    assert (tmp_path / "bucket" / OBJECT).stat().st_size < 100_000
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    with pytest.raises(InputError, match="make room"):
+        made(bucket, Store(tmp_path / "there"), never)
 
 
 def test_failed_work_is_left_to_the_next(bucket: Bucket, tmp_path: Path) -> None:

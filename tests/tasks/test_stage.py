@@ -1,3 +1,4 @@
+import json
 import logging
 import shutil
 from pathlib import Path
@@ -12,8 +13,8 @@ from hnerf.errors import InputError
 from tasks.bucket import VARIABLE
 from tasks.quiet import LOGGERS
 from tasks.source import Source, read_capture
-from tasks.stage import Stage
-from tasks.store import Store
+from tasks.stage import Stage, image_count
+from tasks.store import Artifact, Store
 from tests.tasks.fakes import calls, copy, double, flaky
 
 
@@ -52,6 +53,17 @@ def test_other_settings_do_the_work_again_but_equal_content_stops_there(tmp_path
     second = double(store, copy(store, source, CaptureSettings(max_side_px=64)))
     assert calls(tmp_path) == ["copied", "doubled", "copied"]
     assert first == second
+
+
+def test_images_are_those_of_the_largest_recording(tmp_path: Path) -> None:
+    """Of two cameras each, 2 and 5 frames: 10 images."""
+    recordings = []
+    for frames in (2, 5):
+        (tmp_path / str(frames)).mkdir()
+        described = {"cameras": ["a", "b"], "train_frames": list(range(frames - 1)), "novel_pose_frames": [frames - 1]}
+        (tmp_path / str(frames) / "capture.json").write_text(json.dumps(described))
+        recordings.append(Artifact(stage="capture", root=tmp_path / str(frames), files={}))
+    assert image_count([*recordings, None]) == 10 and image_count([CaptureSettings()]) == 1
 
 
 def test_machines_with_a_bucket_work_once(tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
