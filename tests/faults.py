@@ -98,6 +98,8 @@ FAULTS = (
     Fault("blend-eta", "training/losses", "eta * (1 - target.person)", "(1 - target.person)"),
     Fault("blend-outside", "training/losses", " + (1 - samples.in_box) * samples.alpha", ""),
     Fault("paper-box-samples", "fields/paper", "stratified(entry, leave, ", "stratified(near, far, "),
+    Fault("paper-walks-out", "fields/paper", "torch.maximum(self.centre_m + half_m, box.upper_m[rays.frame])",
+          "self.centre_m + half_m"),
     Fault("paper-start", "fields/mlp", "        self.trunk.init_kaiming()\n", ""),
     Fault("paper-view-octaves", "fields/mlp", "encoding(view, self", "encoding(0 * view, self"),
     Fault("geometry-moves-the-surface", "training/losses", "occupied.detach()", "occupied"),

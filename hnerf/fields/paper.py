@@ -65,11 +65,14 @@ class PaperField(Field):
 
     def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples)."""
-        half_m, inner = self.settings.scene_m, self.settings.box_samples
-        near, far = box_interval(rays, self.centre_m - half_m, self.centre_m + half_m)
+        box, half_m, inner = scene.region, self.settings.scene_m, self.settings.box_samples
+        # a person who walks out of the scene takes it along
+        lower_m = torch.minimum(self.centre_m - half_m, box.lower_m[rays.frame])
+        upper_m = torch.maximum(self.centre_m + half_m, box.upper_m[rays.frame])
+        near, far = box_interval(rays, lower_m, upper_m)
         coarse = stratified(near, far, draws.jitter[:, inner:])
         if inner:
-            entry, leave = (t.clamp(near, far) for t in scene.region.interval(rays))
+            entry, leave = (t.clamp(near, far) for t in box.interval(rays))
             coarse = torch.cat([coarse, stratified(entry, leave, draws.jitter[:, :inner])], 1).sort(1).values
         with torch.no_grad():
             coarse_samples = self._evaluate(dataclasses.replace(scene, correction=None), rays, draws, coarse)
