@@ -100,6 +100,7 @@ FAULTS = (
     Fault("paper-box-samples", "fields/paper", "stratified(entry, leave, ", "stratified(near, far, "),
     Fault("paper-walks-out", "fields/paper", "torch.maximum(self.centre_m + half_m, box.upper_m[rays.frame])",
           "self.centre_m + half_m"),
+    Fault("paper-root-origin", "fields/paper", "(conditions.root - centre.flatten())", "conditions.root"),
     Fault("paper-start", "fields/mlp", "        self.trunk.init_kaiming()\n", ""),
     Fault("paper-view-octaves", "fields/mlp", "encoding(view, self", "encoding(0 * view, self"),
     Fault("geometry-moves-the-surface", "training/losses", "occupied.detach()", "occupied"),

@@ -8,7 +8,7 @@ both.
 import dataclasses
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hnerf.body.canonical import FAR_M, Descriptor, PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -129,14 +129,15 @@ class PaperField(Field):
         self, points_m: Tensor, described: Descriptor, pick: Tensor, row: Tensor, view: Tensor, conditions: Conditions
     ) -> tuple[Tensor, Tensor]:
         """Return density and colour. Outside the box the input is x with a constant distance, and neither pose nor root
-        counts."""
+        counts. The root's translation is from the middle of the scene."""
         scaled = self._scaled(points_m)
         if self.static:
             return self.radiance(scaled, conditions.pose[row, :0], conditions.root[row, :0], view)
         outside = torch.cat([scaled, torch.full_like(scaled[:, :1], OUTSIDE_DISTANCE)], -1)
         inner = torch.cat([described.s, described.d[:, None]], -1) / self.settings.scene_m
         pose = torch.zeros_like(conditions.pose[row]).index_copy(0, pick, conditions.pose[row[pick]])
-        root_inputs = conditions.root[:, : self.root_inputs]
+        centre = nn.functional.pad(self.centre_m[:, None] / self.settings.scene_m, (3, 0))  # (3, 4), like the rows of T
+        root_inputs = (conditions.root - centre.flatten())[:, : self.root_inputs]
         root = torch.zeros_like(root_inputs[row]).index_copy(0, pick, root_inputs[row[pick]])
         return self.radiance(outside.index_copy(0, pick, inner), pose, root, view)
 

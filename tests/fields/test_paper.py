@@ -38,7 +38,7 @@ DEPTHS_M = [1.3, 1.5, 1.8, 2.5, 2.6, 3.5, 4.2, 4.5]
 INSIDE = torch.tensor([0.0, 0, 0, 1, 1, 1, 0, 0])  # B, 5 cm before the body's face, 5 cm behind it and before the other
 X = [-0.85, -0.75, -0.6, -0.25, -0.2, 0.25, 0.6, 0.75]  # in scene units
 S_D = [[0.2, 0.5, 0.125, 0.025], [0.2, 0.5, 0.125, -0.025], [0.2, 0.0, 0.125, -0.025]]
-TURN = [0.0, -1, 0, 1.275, 1, 0, 0, 0, 0, 0, 1, 0]  # the rows of T, its translation in scene units
+TURN = [0.0, -1, 0, 0.275, 1, 0, 0, -0.1, 0, 0, 1, 0.25]  # the rows of T; from the middle of the scene, in its units
 
 
 class Fog(nn.Module):
@@ -283,7 +283,7 @@ def test_what_is_asked_of_a_point_is_what_was_asked_in_training() -> None:
     point, pose, root, seen = field.radiance.asked[-1]
     same(point, rows([[0.25, 0.1, 0.5, 0.025]]))
     same(pose, rows([[-0.4, 0.5, 0.6]]))
-    same(root, rows([[1.0, 0, 0, 0.725, 0, 1, 0, 0.2, 0, 0, 1, -0.5]]))
+    same(root, rows([[1.0, 0, 0, -0.275, 0, 1, 0, 0.1, 0, 0, 1, -0.25]]))
     same(seen, view)
     static = field_of(static=True)
     same(static.signed_distance(standing, point_m, conditions), torch.tensor([0.05 + 2 * 0.1 * -0.025]))
