@@ -116,9 +116,22 @@ def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Pa
 
 def file_named(root: Path, stem: str, *parts: str, suffixes: tuple[str, ...]) -> Path:
     """Return the file called `stem` with one of these suffixes, matched as in `files_in`, in a folder inside the
-    capture; where there is none, the path that it would have with the first suffix."""
-    found = [path for path in files_in(root, *parts, suffixes=suffixes) if _composed(path.stem) == stem]
-    return found[0] if found else path_in_capture(root, *parts, stem + suffixes[0])
+    capture; where there is none, the path that it would have with the first suffix. Raises InputError if there are
+    several."""
+    found = by_camera([path for path in files_in(root, *parts, suffixes=suffixes) if _composed(path.stem) == stem])
+    return found.get(stem) or path_in_capture(root, *parts, stem + suffixes[0])
+
+
+def by_camera(paths: list[Path]) -> dict[str, Path]:
+    """Return files by the camera that they are named after. Raises InputError on a name that no camera can have, or if
+    two files have the same."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        name = check_camera_name(path.stem, path)
+        if name in found:
+            raise InputError(f"{path}: camera {name} is also {found[name].name}; keep one of them")
+        found[name] = path
+    return found
 
 
 def numbered(paths: list[Path], what: str) -> dict[int, Path]:

@@ -12,7 +12,15 @@ from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.pose2sim import Pose2Sim, lens_from_table
 from hnerf.capture.lens import Lens
-from hnerf.capture.safe_io import VIDEO_SUFFIXES, check_camera_name, file_named, files_in, path_in_capture, read_toml
+from hnerf.capture.safe_io import (
+    VIDEO_SUFFIXES,
+    by_camera,
+    check_camera_name,
+    file_named,
+    files_in,
+    path_in_capture,
+    read_toml,
+)
 from hnerf.capture.video_metadata import focal_35mm
 from hnerf.errors import InputError
 
@@ -35,7 +43,7 @@ def cameras_without_calibration(folder: Path) -> list[str]:
         return [check_camera_name(path.name, path) for path in sorted(images.iterdir()) if path.is_dir()]
     for place in (("videos",), ()):
         if videos := files_in(folder, *place, suffixes=VIDEO_SUFFIXES):
-            return [check_camera_name(path.stem, path) for path in videos]
+            return list(by_camera(videos))
     return []
 
 

@@ -130,6 +130,10 @@ EASYMOCAP = {
         lambda f: _edit(f / "intri.yml", "W_02: 24", "W_02: 32"),
         "24 x 16 px, but camera 02",
     ),
+    "two plates of one camera": (
+        lambda f: [write_image(f / "background" / name, rec.picture("01", 0)) for name in ("01.jpg", "01.png")],
+        "background/01.png: camera 01 is also 01.jpg; keep one of them",
+    ),
     "plate of another size": (
         lambda f: write_image(f / "background/01.png", np.zeros((8, 8, 3), np.uint8)),
         "background/01.png",
@@ -241,6 +245,10 @@ POSE2SIM = {
     ),
     "fisheye": (lambda f: _edit(f / "calibration/Calib.toml", "fisheye = false", "fisheye = true"), "fisheye"),
     "video missing": (lambda f: (f / "videos/cam02.mp4").unlink(), "videos/cam02.mp4"),
+    "two videos of one camera": (
+        lambda f: shutil.copy(f / "videos/cam02.mp4", f / "videos/cam02.MOV"),
+        "videos/cam02.mp4: camera cam02 is also cam02.MOV; keep one of them",
+    ),
     "video is none": (lambda f: (f / "videos/cam02.mp4").write_bytes(b"0" * 100), "videos/cam02.mp4"),
     "video is a list of other files": (
         lambda f: [

@@ -105,6 +105,16 @@ def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> No
     assert capture.cameras["left"].K[0, 0] == pytest.approx(0.85 * 96)
 
 
+@pytest.mark.parametrize("place", ["", "videos"])
+def test_two_videos_of_one_name_are_refused_and_sound_is_none(tmp_path: Path, place: str) -> None:
+    write_video(tmp_path / place / "ada.mp4")
+    (tmp_path / place / "ada.wav").touch()
+    assert cameras_without_calibration(tmp_path) == ["ada"]
+    (tmp_path / place / "ada.MOV").touch()
+    with pytest.raises(InputError, match=r"ada\.mp4: camera ada is also ada\.MOV; keep one of them"):
+        cameras_without_calibration(tmp_path)
+
+
 def test_a_run_names_the_command_that_calibrates(tmp_path: Path) -> None:
     write_images(tmp_path, "a")
     with pytest.raises(InputError, match=r"no calibration.*hnerf calibrate .* --from person"):
