@@ -62,9 +62,11 @@ def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
 
 
 def _frame(image_id: object) -> int:
-    """Return the frame number that ends an image_id: 12, "12.jpg" and "walk_000012.png" are frame 12. Raises ValueError
-    if there is none."""
-    found = re.search(r"([0-9]{1,9})(\.\w+)?$", str(image_id))
+    """Return the frame number that an image_id is, or that ends it: 12, "12.jpg" and "walk_000012.png" are frame 12.
+    Raises ValueError if there is none."""
+    if type(image_id) is int and image_id >= 0:
+        return image_id
+    found = re.search(r"([0-9]{1,9})(\.\w+)?$", image_id) if isinstance(image_id, str) else None
     if not found:
         raise ValueError(image_id)
     return int(found[1])

@@ -145,9 +145,10 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
     (tmp_path / "01.json").write_text(json.dumps([{}] * 129))
     with pytest.raises(InputError, match=r"01\.json: 129 people in 2 images; keep at most 64 in each"):
         read_results(tmp_path / "01.json", (0, 1))
-    (tmp_path / "01.json").write_text(json.dumps([{"image_id": "cover", "keypoints": []}]))
-    with pytest.raises(InputError, match=r"01\.json: no list of image_id"):
-        read_results(tmp_path / "01.json", (0,))
+    for name in ("cover", -3, 1.5, True):
+        (tmp_path / "01.json").write_text(json.dumps([{"image_id": name, "keypoints": []}]))
+        with pytest.raises(InputError, match=r"01\.json: no list of image_id"):
+            read_results(tmp_path / "01.json", (0, 1, 3))
 
 
 def test_results_beside_the_images_come_through_the_door(tmp_path: Path) -> None:
