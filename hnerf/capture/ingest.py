@@ -25,6 +25,7 @@ from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import (
+    NO_FRAME,
     CameraSplit,
     CaptureManifest,
     capture_name,
@@ -96,6 +97,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     clocks = {} if len(filmed) == 1 else read_clocks(folder)
     footage = in_step(filmed, clocks, manifest.fps or DEFAULT_FPS)
     recorded = _common_frames(footage)
+    _check_subject(folder, manifest, {name: {*recorded, *filmed[name].frames} for name in cameras.train})
     people = _people_in_step(layout, footage)
     seen = [people[name] for name in cameras.train if name in people]
     occupied = recorded if manifest.frames else _frames_with_people(seen, recorded)
@@ -126,7 +128,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
         picture_areas_px=areas,
         frame_step=median_step(recorded),
-        subject_point=_subject_point(folder, manifest, {name: normalisers[name] for name in cameras.train}, wanted),
+        subject_point=_subject_point(manifest, normalisers, wanted),
         stature_m=manifest.stature_m,
         recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
@@ -210,16 +212,31 @@ def _warn_of_unread(folder: Path, places: tuple[str, ...], expected: set[str]) -
             log.warning("%s: %s not in the calibration, and not read; rename or remove them", found, some)
 
 
+def _check_subject(folder: Path, manifest: CaptureManifest, recorded: dict[str, set[int]]) -> None:
+    """Raise InputError if the point that names the subject is in no training camera, or in no frame that was recorded,
+    by camera."""
+    point = manifest.subject_point
+    if point is None or not point.camera:
+        return
+    path = folder / "capture.toml"
+    if point.camera not in recorded:
+        raise InputError(f"{path}: subject: there is no training camera {point.camera}; correct it")
+    frames = recorded[point.camera]
+    if point.frame != NO_FRAME and point.frame not in frames:
+        raise InputError(
+            f"{path}: subject: frame {point.frame} is none of the recording's frames {min(frames)} to {max(frames)}; "
+            "correct it"
+        )
+
+
 def _subject_point(
-    folder: Path, manifest: CaptureManifest, normalisers: dict[str, Normaliser], frames: tuple[int, ...]
+    manifest: CaptureManifest, normalisers: dict[str, Normaliser], frames: tuple[int, ...]
 ) -> SubjectPoint | None:
     """Return the point that names the subject, in pixels of the normalised image of the chosen frame nearest to its
-    own (the first one where it names none). Raises InputError on a camera that is not for training."""
+    own (the first one where it names none)."""
     point = manifest.subject_point
     if point is None or not point.camera:
         return point
-    if point.camera not in normalisers:
-        raise InputError(f"{folder / 'capture.toml'}: subject: there is no training camera {point.camera}; correct it")
     x, y, _ = normalisers[point.camera].keypoints(np.array([*point.at, 1.0]))
     frame = min(frames, key=lambda chosen: abs(chosen - point.frame))
     return SubjectPoint((float(x), float(y)), point.camera, frame)

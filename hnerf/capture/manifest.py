@@ -22,8 +22,9 @@ log = logging.getLogger("hnerf.capture")
 
 MIN_KEY_SIMILARITY = 0.8  # of an unknown key to a known one (difflib) that makes it a typing error
 MAX_BYTES = 65_536
-NAMED_BY, NUMBER = "nearest", r"\s*(-?\d+(?:\.\d*)?)\s*"
+NAMED_BY, NUMBER = "nearest", r"\s*(-?\d{1,9}(?:\.\d*)?)\s*"
 SUBJECT = re.compile(rf"nearest to \({NUMBER},{NUMBER}\)(?: in (.+?)(?: at frame (\d{{1,9}}))?)?")
+NO_FRAME = -1  # of a subject's point
 MAX_NAME_BYTES = 200  # file systems allow 255, also for longer names made from it
 
 FrameNumber = Annotated[int, Field(ge=0, le=999_999_999)]
@@ -79,12 +80,12 @@ class CaptureManifest(_Table):
     @property
     def subject_point(self) -> SubjectPoint | None:
         """Return the point by which the subject is named, in recorded pixels or in metres; None where there is none.
-        The frame is -1 where none is given."""
+        The frame is NO_FRAME where none is given."""
         named = SUBJECT.fullmatch(self.subject) if isinstance(self.subject, str) else None
         if not named:
             return None
         x, y, camera, frame = named.groups()
-        return SubjectPoint((float(x), float(y)), camera or "", int(frame or -1))
+        return SubjectPoint((float(x), float(y)), camera or "", int(frame or NO_FRAME))
 
     @field_validator("units", mode="wrap")
     @classmethod

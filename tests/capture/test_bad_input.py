@@ -219,6 +219,14 @@ EASYMOCAP = {
         _toml('subject = "nearest (1, 2)"\n'),
         'subject: write "near',
     ),
+    "toml with a subject at the end of the world": (
+        _toml(f'subject = "nearest to ({"9" * 400}, 1)"\n'),
+        'subject: write "near',
+    ),
+    "toml with a subject in a frame that was not recorded": (
+        _toml('subject = "nearest to (1, 2) in 01 at frame 999"\n'),
+        "capture.toml: subject: frame 999 is none of the recording's frames 0 to 4; correct it",
+    ),
     "toml with a subject in no camera": (_toml('subject = "nearest to (1, 2) in 07"\n'), "no training camera 07"),
     "toml with an impossible field of view": (_toml("field_of_view_deg = 200\n"), "field_of_view_deg"),
     "toml name leaves the store": (_toml('name = "../../other"\n'), "name '../../other'"),

@@ -108,15 +108,15 @@ def test_what_is_no_video(tmp_path: Path) -> None:
 
 
 def test_the_subject_is_named_in_recorded_pixels(tmp_path: Path) -> None:
-    """Images of 24 x 16 px are halved: (13, 5) becomes (13.5 / 2 - .5, 5.5 / 2 - .5); frame 9 is not there, 4 is."""
+    """Images of 24 x 16 px are halved: (13, 5) becomes (13.5 / 2 - .5, 5.5 / 2 - .5); frame 4 is not used, 3 is."""
     folder = write_easymocap(tmp_path / "ada")
     half = CaptureSettings.model_construct(max_side_px=12, max_frames=60)
     for text, expected in (
-        ("nearest to (13, 5) in 02 at frame 9", SubjectPoint((6.25, 2.25), "02", 4)),
+        ("nearest to (13, 5) in 02 at frame 4", SubjectPoint((6.25, 2.25), "02", 3)),
         ("nearest to (13, 5) in 02", SubjectPoint((6.25, 2.25), "02", 0)),
         ("nearest to (-0.5, 2)", SubjectPoint((-0.5, 2.0), "", -1)),
         ("Ada Lovelace", None),
     ):
-        (folder / "capture.toml").write_text(f'subject = "{text}"\n')
+        (folder / "capture.toml").write_text(f'subject = "{text}"\n[frames]\ntrain = [0, 3]\n')
         ingest(folder, half, tmp_path / "out")
         assert Capture.load(tmp_path / "out").subject_point == expected
