@@ -14,7 +14,7 @@ from hnerf.capture.footage import Footage, ImageFolder
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.lens import Lens, checked_lens
-from hnerf.capture.safe_io import path_in_capture
+from hnerf.capture.safe_io import path_in_capture, shown
 from hnerf.capture.safe_pickle import read_pickled_npy
 from hnerf.errors import InputError
 
@@ -39,13 +39,23 @@ class ZjuMocap(Layout):
         """Return the images' paths by camera, named after an image's own folder, and by frame."""
         try:
             rows = [[PurePosixPath(str(path)) for path in row["ims"]] for row in self._annotations["ims"]]
-            names = [unicodedata.normalize("NFC", path.parent.name) for path in rows[0]]
+            names = [_camera(path) for path in rows[0]]
             frames = [_frame(row[0]) for row in rows]
             columns = list(zip(*rows, strict=True))
+            strays = [
+                path
+                for frame, row in zip(frames, rows, strict=True)
+                for name, path in zip(names, row, strict=True)
+                if (_camera(path), _frame(path)) != (name, frame)
+            ]
         except (IndexError, KeyError, TypeError, ValueError):
             raise InputError(
                 f"{self.source}: 'ims' does not list images by frame number, as many a frame; prepare it again"
             ) from None
+        if strays:
+            raise InputError(
+                f"{self.source}: lists {shown(str(strays[0]))} where another camera or frame belongs; prepare it again"
+            )
         if len(set(names)) < len(names) or len(set(frames)) < len(frames):
             raise InputError(f"{self.source}: lists two images of one camera and frame; prepare it again")
         return {name: dict(zip(frames, paths, strict=True)) for name, paths in zip(names, columns, strict=True)}
@@ -107,6 +117,11 @@ class ZjuMocap(Layout):
                 betas.append(shape)
         poses.betas[:] = np.mean(betas, 0) if betas else 0
         return poses
+
+
+def _camera(path: PurePosixPath) -> str:
+    """Return the name of the camera of an image."""
+    return unicodedata.normalize("NFC", path.parent.name)
 
 
 def _frame(path: PurePosixPath) -> int:

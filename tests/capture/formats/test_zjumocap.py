@@ -113,11 +113,22 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
     (folder / "mask_cihp" / "Camera_B2" / "000001.png").unlink()
     refused(r"mask_cihp/Camera_B2/000001\.png: image missing; add it")
     annotations = np.load(folder / "annots.npy", allow_pickle=True).item()
-    annotations["ims"][0]["ims"][1] = "../secret/000000.jpg"
+    for frame, row in enumerate(annotations["ims"]):
+        row["ims"] = [row["ims"][0], f"../secret/{frame:06d}.jpg"]
     np.save(folder / "annots.npy", annotations, allow_pickle=True)
     refused("leaves the capture folder")
     np.save(folder / "annots.npy", {"cams": {}, "ims": []}, allow_pickle=True)  # type: ignore[arg-type]
     refused(r"annots\.npy: 'ims' does not list images")
+
+
+@pytest.mark.parametrize("stray", ["Camera_B1/000001.jpg", "Camera_B2/000002.jpg"])
+def test_images_of_another_camera_or_frame_are_refused(stray: str, folder: Path, tmp_path: Path) -> None:
+    """Rows, but the first, could exchange cameras, and columns, but the first, frames."""
+    annotations = np.load(folder / "annots.npy", allow_pickle=True).item()
+    annotations["ims"][1]["ims"][1] = stray
+    np.save(folder / "annots.npy", annotations, allow_pickle=True)
+    with pytest.raises(InputError, match=rf"annots\.npy: lists '{stray}' where another camera or frame belongs"):
+        ingest(folder, CaptureSettings(), tmp_path / "out")
 
 
 @pytest.mark.parametrize("name", ["1566547850592{}.jpg", "a_b_c_d_-{}_x.jpg", "²{}.jpg"])
