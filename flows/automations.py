@@ -25,7 +25,9 @@ from flows.ingest_captures import DISK_EVENT
 SILENCE_S = 150  # five heartbeats of prefect.toml
 MIN_SILENCE_S = 60
 BLOCK = "hnerf-operator"
-SIGNS_OF_LIFE = {f"prefect.flow-run.{sign}" for sign in ("heartbeat", "Pending", "Submitting", "InfrastructurePending")}
+# Whatever event of a run ends the wait for a sign of life, so that all those before its heartbeats must begin it anew.
+STARTING = ("Pending", "Submitting", "InfrastructurePending", "pull-step.executed")
+SIGNS_OF_LIFE = {f"prefect.flow-run.{sign}" for sign in ("heartbeat", *STARTING)}
 RUNS = {"prefect.resource.id": "prefect.flow-run.*"}
 
 

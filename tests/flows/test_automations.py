@@ -64,19 +64,26 @@ def test_without_a_webhook_only_lost_runs_are_ended(prefect_api: str) -> None:
 
 def test_silence_is_longer_than_some_heartbeats() -> None:
     trigger = lost_runs(150).trigger
-    signs = ("heartbeat", "Pending", "Submitting", "InfrastructurePending")
+    signs = ("heartbeat", "Pending", "Submitting", "InfrastructurePending", "pull-step.executed")
     assert trigger.after == {f"prefect.flow-run.{sign}" for sign in signs} and trigger.posture == "Proactive"
 
 
 @pytest.mark.soak
+@pytest.mark.parametrize("pulled", [False, True])
 @pytest.mark.parametrize("state", [Pending, Submitting])
-def test_a_run_whose_worker_is_lost_while_it_begins_it_crashes(prefect_api: str, state: Callable[[], State]) -> None:
+def test_a_run_whose_worker_is_lost_while_it_begins_it_crashes(
+    prefect_api: str, state: Callable[[], State], pulled: bool
+) -> None:
     """It has no heartbeat yet, and would be about to begin for ever."""
     with get_client(sync_client=True) as client:
         automation = client.create_automation(lost_runs(10))
         time.sleep(5)  # until the server has read it
         run = client.create_flow_run(flow(lambda: None, name="begun"))
         client.set_flow_run_state(run.id, state())
+        if pulled:  # its process lived long enough to change into the folder of the deployment
+            emit_event(
+                "prefect.flow-run.pull-step.executed", resource={"prefect.resource.id": f"prefect.flow-run.{run.id}"}
+            )
         deadline = time.monotonic() + PATIENCE_S
         while not (now := client.read_flow_run(run.id).state).is_crashed() and time.monotonic() < deadline:
             time.sleep(1)
