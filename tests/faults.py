@@ -213,6 +213,8 @@ FAULTS = (
           "np.nan_to_num(dist"),
     Fault("reach-behind", "geometry/reach", "xy, depth_m = xy[depth_m > 0], depth_m[depth_m > 0]",
           "depth_m = depth_m[depth_m > 0]", "training/pixels"),
+    Fault("reach-wide-angle", "geometry/reach", "radius * np.sqrt(1 + x**2 + y[:, None] ** 2)",
+          "radius + 0 * (x + y[:, None])", "training/pixels"),
     # the fit of the body
     Fault("ground-offsets", "body/ground", " + pose.offsets_m[:, 2]", ""),
     Fault("ground-one-foot", "body/ground", "for foot in (LEFT, RIGHT)", "for foot in (LEFT, LEFT)"),

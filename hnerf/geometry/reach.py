@@ -35,8 +35,10 @@ def within_box(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], margin_m: f
 def within_reach(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], reach_m: float) -> Bool[np.ndarray, "H W"]:
     """Return the pixels whose rays pass within about `reach_m` of the body.
 
-    Each vertex in front of the camera, in the image or beside it, covers a disc of the radius that the nearest vertices
-    need.
+    The ray through p passes a point at depth z that projects to v at a distance of at least z |p - v| cos(a), where p
+    and v are in focal lengths and the ray is at an angle a from the axis: equal if p, v and the middle lie on a line.
+    So each vertex in front of the camera, in the image or beside it, covers the pixels closer than reach_m / (z
+    cos(a)), with the z of the nearest vertices for all.
     """
     size_px = np.array(camera.size_px)
     xy, depth_m = camera.project(vertices_m)
@@ -45,9 +47,12 @@ def within_reach(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], reach_m: 
         return np.zeros(size_px[::-1], bool)
     nearest_m, focal_px = np.percentile(depth_m, NEAREST_PERCENT), max(camera.K[0, 0], camera.K[1, 1])
     radius = int(np.ceil(min(reach_m * focal_px / nearest_m, np.hypot(*size_px))))
-    xy = np.round(xy) + radius
-    x, y = xy[((xy >= 0) & (xy < size_px + 2 * radius)).all(1)].astype(int).T
-    outside = np.ones(size_px[::-1] + 2 * radius, np.uint8)
+    x, y = (((np.arange(n) - camera.K[k, 2]) / camera.K[k, k]).astype(np.float32) for k, n in enumerate(size_px))
+    radii = radius * np.sqrt(1 + x**2 + y[:, None] ** 2)  # 1 / cos(a) is the length of the ray at a depth of 1
+    margin = int(np.ceil(radii.max()))
+    xy = np.round(xy) + margin
+    x, y = xy[((xy >= 0) & (xy < size_px + 2 * margin)).all(1)].astype(int).T
+    outside = np.ones(size_px[::-1] + 2 * margin, np.uint8)
     outside[y, x] = 0
     distance_px = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return distance_px[radius:-radius, radius:-radius] <= radius
+    return distance_px[margin:-margin, margin:-margin] <= radii

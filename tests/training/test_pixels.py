@@ -19,6 +19,7 @@ from hnerf.training.plates import plates_of
 from tests.training.scene import SIZE_PX, record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
+AFAR = dataclasses.replace(AHEAD, K=np.diag([5000.0, 5000.0, 1.0]))  # its rays are all but parallel
 ALONE = Distributed(0, 1, torch.device("cpu"))
 REACHED = functools.partial(within_reach, reach_m=0.2)
 
@@ -124,9 +125,9 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
 
 
 def test_a_body_inside_the_image_reaches_a_disc_around_each_vertex():
-    """A reach of 20 cm at 2 m with 50 px focal length is 5 px."""
+    """A reach of 20 cm at 200 m with 5000 px focal length is 5 px."""
     xy = np.random.default_rng(0).integers([8, 8], [52, 32], (30, 2))
-    visible_pixels = within_reach(AHEAD, np.hstack([xy / 25, np.full((30, 1), 2.0)]), 0.2)
+    visible_pixels = within_reach(AFAR, np.hstack([xy / 25, np.full((30, 1), 200.0)]), 0.2)
     y, x = np.mgrid[:40, :60]
     squared = (x[..., None] - xy[:, 0]) ** 2 + (y[..., None] - xy[:, 1]) ** 2
     assert np.array_equal(visible_pixels, squared.min(-1) <= 25)
@@ -134,23 +135,30 @@ def test_a_body_inside_the_image_reaches_a_disc_around_each_vertex():
 
 def test_a_body_beside_the_image_reaches_into_it():
     """A vertex 3 px left of the image, in row 20, is a disc of 5 px: columns 0 to 2 of that row."""
-    visible_pixels = within_reach(AHEAD, np.array([[-3 / 25, 20 / 25, 2.0]]), 0.2)
+    visible_pixels = within_reach(AFAR, np.array([[-3 / 25, 20 / 25, 200.0]]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [0, 1, 2]
     assert visible_pixels.any(1).nonzero()[0].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 24]
 
 
 def test_an_arm_towards_the_camera_reaches_as_far_as_it_is_large():
-    """20 cm are 10 px at 1 m, although most of the body is at 2 m, where they are 5 px."""
-    arm, body = np.tile([[20 / 50, 20 / 50, 1.0]], (3, 1)), np.tile([[50 / 25, 20 / 25, 2.0]], (20, 1))
-    visible_pixels = within_reach(AHEAD, np.vstack([arm, body]), 0.2)
+    """20 cm are 10 px at 100 m, although most of the body is at 200 m, where they are 5 px."""
+    arm, body = np.tile([[20 / 50, 20 / 50, 100.0]], (3, 1)), np.tile([[50 / 25, 20 / 25, 200.0]], (20, 1))
+    visible_pixels = within_reach(AFAR, np.vstack([arm, body]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [*range(10, 31), *range(40, 60)]
 
 
 def test_pixels_that_are_longer_than_wide_are_reached_by_the_larger_focal_length():
-    """20 cm at 2 m are 5 px of 50 px across, and 2.5 px of 25 px along: all within a disc of 5 px."""
-    camera = dataclasses.replace(AHEAD, K=np.diag([50.0, 25.0, 1.0]))
-    visible_pixels = within_reach(camera, np.array([[20 / 25, 20 / 12.5, 2.0]]), 0.2)
+    """20 cm at 200 m are 5 px of 5000 px across, and 2.5 px of 2500 px along: all within a disc of 5 px."""
+    camera = dataclasses.replace(AFAR, K=np.diag([5000.0, 2500.0, 1.0]))
+    visible_pixels = within_reach(camera, np.array([[20 / 25, 20 / 12.5, 200.0]]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [*range(15, 26)]
+
+
+def test_what_is_off_the_axis_reaches_farther_away_from_it():
+    """45 degrees off, at (2, 0, 2) m and column 50, the ray through column p passes at 2 |1 - p / 50| / sqrt(1 + (p /
+    50)^2) m: those of 44 and 57 at 18 cm, those of 43 and 58 at 21 cm."""
+    visible_pixels = within_reach(AHEAD, np.array([[2.0, 0.0, 2.0]]), 0.2)
+    assert np.flatnonzero(visible_pixels[0]).tolist() == [*range(44, 58)]
 
 
 def test_what_is_behind_the_camera_covers_nothing():
