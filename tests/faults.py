@@ -189,6 +189,7 @@ FAULTS = (
           "root[-1] = root[0]; root[rows, :3, 3] = centre", "training/trainer_step"),
     Fault("trainer-tighten", "training/trainer", "if self.step <= self.field_steps:", "if False:",
           "training/trainer_step"),
+    Fault("person-of-all-cameras", "training/auto_settings", "+= len(kept) *", "+= len(capture.train_frames) *"),
     Fault("checkpoint-optimizer", "training/trainer", 'self.optimizer.load_state_dict(state["optimizer"])', "pass"),
     Fault("exposure-mean", "training/exposure", "weight * np.median(found, 0)", "weight * np.mean(found, 0)"),
     Fault("exposure-clipped", "training/exposure", " & (levels[seen] < MAX_LEVEL).all(1)", ""),

@@ -70,10 +70,10 @@ class SceneStatistics:
         """Measure the statistics, with some masks of every training camera. Raises InputError if no mask shows the
         person."""
         vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
-        footprints_m, outlines_m, images, areas_px = [], [], 0, []
+        footprints_m, outlines_m, person_px = [], [], 0.0
         for camera in (capture.cameras[name] for name in capture.train_cameras):
             kept = [frame for frame in capture.train_frames if (camera.name, frame) in masks]
-            images += len(kept)
+            areas_px = []
             for frame in evenly_spaced(kept, MASKS_PER_CAMERA):
                 points_m = vertices_m[body.index(frame)]
                 footprints_m.append(float(np.median(camera.project(points_m)[1])) / camera.K[0, 0])
@@ -81,6 +81,7 @@ class SceneStatistics:
                 mask = masks.get(camera.name, frame)
                 outlines_m.append(footprints_m[-1] * _outline_distance_px(mask, covered))
                 areas_px.append(mask.sum())
+            person_px += len(kept) * float(np.mean(areas_px or [0]))
         if not sum(map(len, outlines_m)):
             raise InputError(f"{capture.name}: no mask shows the person; see the report of the segmentation")
         inside_m, outside_m = np.percentile(np.concatenate(outlines_m), [1, 99])
@@ -95,7 +96,7 @@ class SceneStatistics:
             inside_m=float(max(-inside_m, 0)),
             side_m=float((body.rig.vertices_m.amax(0) - body.rig.vertices_m.amin(0)).max()),
             std_rad=float((angles - angles.mean(0)).square().sum(-1).mean(0).sqrt().mean()),
-            person_px=round(images * float(np.mean(areas_px))),
+            person_px=round(person_px),
             lowest_m=(float(np.median(lowest_m)), float(lowest_m.min())),
         )
 

@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hnerf.capture.masks import Masks, encode
 from hnerf.config import TrainingSettings
+from hnerf.training import auto_settings
 from hnerf.training.auto_settings import SceneStatistics, decide
-from tests.training.scene import record
+from tests.training.scene import SIZE_PX, record
 
 SCENE = SceneStatistics(
     cameras=4,
@@ -166,3 +168,16 @@ def test_a_scene_as_it_is_measured(tmp_path: Path):
     assert scene.lowest_m == pytest.approx((0.0, 0.0), abs=1e-6)
     areas = [masks.get(c, f).sum() for c in capture.train_cameras for f in capture.train_frames]
     assert scene.person_px == pytest.approx(np.sum(areas), rel=0.01)
+
+
+def test_a_camera_counts_by_the_masks_that_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One mask a camera is measured. Camera 0 has one of 32 x 32 pixels, the others have two of 10 x 10 each: 1024 + 3
+    x 2 x 100. Camera 3 then loses its own."""
+    monkeypatch.setattr(auto_settings, "MASKS_PER_CAMERA", 1)
+    capture, _, body = record(tmp_path)
+    whole, part = np.ones((SIZE_PX, SIZE_PX), bool), np.zeros((SIZE_PX, SIZE_PX), bool)
+    part[11:21, 11:21] = True
+    masks = {("0", 0): encode(whole)} | {(camera, frame): encode(part) for camera in "123" for frame in (0, 1)}
+    assert SceneStatistics.of(capture, Masks(masks, {}), body).person_px == 1624
+    del masks["3", 0], masks["3", 1]
+    assert SceneStatistics.of(capture, Masks(masks, {}), body).person_px == 1424
