@@ -8,7 +8,7 @@ import trimesh
 from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 from hnerf.warp_import import wp
 
-REACH_M = 10.0  # beyond any distance that is asked for
+REACH_M = 1.0e5  # beyond any distance that is asked for; warp takes as long with it as with a few metres
 RAY_START_M = 2.0e-3  # escape rays start this far off the surface, so that they do not hit it at once
 BLOCKS = (8, 4, 2, 1)  # nodes along a side of the blocks that `Surface.occupancy` tests
 

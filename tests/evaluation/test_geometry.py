@@ -72,6 +72,12 @@ def test_the_prediction_is_what_must_be_closed() -> None:
         assert score["watertight"] is closed
 
 
+def test_what_is_far_away_is_as_near_as_its_nearest_face() -> None:
+    distance_m, face = Surface(cube()).closest(np.array([[20.0, 0, 0], [0, 0, -2000.0]]))
+    assert distance_m == pytest.approx([19.5, 1999.5])
+    np.testing.assert_allclose(cube().face_normals[face], [[1, 0, 0], [0, 0, -1]], atol=1e-12)
+
+
 def test_overlap_of_offset_cubes() -> None:
     surfaces = Surface(cube()), Surface(cube(0.5))
     # Nodes in the middle of cells of 1/64 m that no side of a cube cuts: counted volumes are exact.
