@@ -7,6 +7,7 @@ from uuid import uuid4
 
 from pydantic import Field, model_validator
 
+from hnerf.config import validated
 from hnerf.errors import InputError
 from tasks.inventory import Inventory
 from tasks.packed import Contents, Name, archived, pack, place, read_contents, require_room, unpack
@@ -41,9 +42,8 @@ def export_subject(store: Store, subject: str, out: Path) -> Manifest:
     if not latest:
         raise InputError(f"{store.subject_folder(subject)}: no results; `hnerf store list` names the subjects")
     artifacts = [_intact(store, *name.split("/")) for name in sorted(inventory.with_inputs(latest.values()))]
-    manifest = Manifest(
-        subject=subject, recording=store.recording(subject), latest=latest, artifacts=archived(artifacts)
-    )
+    described = {"subject": subject, "recording": store.recording(subject), "latest": latest}
+    manifest = validated(Manifest, {**described, "artifacts": archived(artifacts)}, store.subject_folder(subject))
     beside = out.with_name(f".{uuid4().hex}")
     try:
         pack(manifest, store, beside)

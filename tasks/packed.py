@@ -85,7 +85,7 @@ Kind = TypeVar("Kind", bound=Contents)
 def archived(artifacts: Iterable[Artifact]) -> dict[str, ArchivedArtifact]:
     """Return what a manifest says of artifacts."""
     return {
-        one.name: ArchivedArtifact.model_validate(one.model_dump(include={"files", "metrics", "inputs"}))
+        one.name: validated(ArchivedArtifact, one.model_dump(include={"files", "metrics", "inputs"}), one.root)
         for one in artifacts
     }
 

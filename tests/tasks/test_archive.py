@@ -16,7 +16,7 @@ from tasks.archive import export_subject, import_subject
 from tasks.garbage import collect, find_garbage
 from tasks.inventory import Inventory, recording_of
 from tasks.packed import manifest_name
-from tasks.store import Store
+from tasks.store import RECORDING, Store
 from tasks.verify import faults
 from tests.tasks.stores import names, run_of
 
@@ -45,6 +45,24 @@ def test_a_subject_comes_out_and_in_with_all_it_was_computed_from(packed: Path, 
         assert recording_of(store, "ada") == "/recordings/ada"
         assert faults(store).lines == []
     assert not list(store.root.glob("*/*.moving"))
+
+
+def test_a_store_that_an_archive_could_not_hold_is_one_line(tmp_path: Path) -> None:
+    """A damaged note of the recording, and a record of a file that lies elsewhere."""
+    store = Store(tmp_path / "from")
+    capture, *_ = run_of(store, "ada", 10)
+    (store.subject_folder("ada") / RECORDING).write_bytes(b"\xff\0")
+    with pytest.raises(InputError, match=r"subjects/ada: recording: [^\n]*; correct it$"):
+        export_subject(store, "ada", tmp_path / "ada.tar")
+    (tmp_path / "secret").write_text("abc 10")
+    record = store.path("capture", capture.root.name, ".json")
+    described = json.loads(record.read_text())
+    described["files"][str(tmp_path / "secret")] = described["files"]["deep/letters"]
+    record.write_text(json.dumps(described))
+    with pytest.raises(
+        InputError, match=rf"{capture.root}: '{tmp_path}/secret' is not a path inside a folder; correct"
+    ):
+        export_subject(store, "ada", tmp_path / "ada.tar")
 
 
 def test_a_run_beside_it_that_has_some_keeps_them(packed: Path, tmp_path: Path) -> None:
