@@ -46,9 +46,11 @@ def within_reach(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], reach_m: 
     if not len(depth_m):
         return np.zeros(size_px[::-1], bool)
     nearest_m, focal_px = np.percentile(depth_m, NEAREST_PERCENT), max(camera.K[0, 0], camera.K[1, 1])
-    radius = int(np.ceil(min(reach_m * focal_px / nearest_m, np.hypot(*size_px))))
+    across_px = np.hypot(*size_px)
+    radius = int(np.ceil(min(reach_m * focal_px / nearest_m, across_px)))
     x, y = (((np.arange(n) - camera.K[k, 2]) / camera.K[k, k]).astype(np.float32) for k, n in enumerate(size_px))
-    radii = radius * np.sqrt(1 + x**2 + y[:, None] ** 2)  # 1 / cos(a) is the length of the ray at a depth of 1
+    # 1 / cos(a) is the length of the ray at a depth of 1.
+    radii = np.minimum(radius * np.sqrt(1 + x**2 + y[:, None] ** 2), across_px)
     margin = int(np.ceil(radii.max()))
     xy = np.round(xy) + margin
     x, y = xy[((xy >= 0) & (xy < size_px + 2 * margin)).all(1)].astype(int).T
