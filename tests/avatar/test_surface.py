@@ -1,11 +1,16 @@
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+import trimesh
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from hnerf.avatar.surface import extract_surface
+from hnerf.avatar.surface import _largest_component, extract_surface, surface_in_pose
 from hnerf.errors import InputError
+from tests.body.boxes import box_rig
 
 LOWER_M, UPPER_M = torch.tensor([-0.5, -0.6, -1.0]), torch.tensor([0.5, 0.6, 1.0])
 
@@ -45,6 +50,23 @@ def test_only_the_largest_component_stays() -> None:
 
     mesh = extract_surface(two_spheres, LOWER_M, UPPER_M, 48)
     assert mesh.vertices[:, 2].max() == pytest.approx(0.3, abs=0.002)
+
+
+def test_the_largest_component_is_that_of_the_greatest_area() -> None:
+    """A cube of 12 faces and 6 m2 beside a ball of 80 faces and about .12 m2."""
+    cube, ball = trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(1, 0.1).apply_translation([3, 0, 0])
+    assert _largest_component(trimesh.util.concatenate([ball, cube])).area == pytest.approx(6)
+
+
+def test_clothes_18_cm_off_the_body_are_meshed() -> None:
+    """The distance is that to the unit box of the body, and 18 cm around it."""
+
+    def distance(points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        return torch.maximum(-points_m, points_m - 1).amax(-1) - 0.18
+
+    avatar: Any = SimpleNamespace(body=SimpleNamespace(rig=box_rig()), signed_distance=distance)
+    mesh = surface_in_pose(avatar, torch.zeros(2, 3), torch.eye(4), 64)
+    np.testing.assert_allclose(mesh.extents, 1.36, atol=0.01)
 
 
 @pytest.mark.parametrize(

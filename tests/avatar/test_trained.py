@@ -4,16 +4,19 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from hnerf.avatar import trained as model
 from hnerf.avatar.model_file import write_field
-from hnerf.avatar.trained import build_field, load_avatar
+from hnerf.avatar.trained import TrainedAvatar, build_field, load_avatar
+from hnerf.body.fit_result import BodyFit
 from hnerf.config import TrainingSettings
 from hnerf.errors import InputError
 from hnerf.fields.paper import PaperField
 from hnerf.fields.rays import PosedScene, Rays
+from tests.body.boxes import box_rig
 from tests.training.scene import TINY, record
 
 
@@ -70,3 +73,14 @@ def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path
     monkeypatch.setattr(model, "SAMPLES_PER_BATCH", 2048)
     avatar.render(capture.cameras["0"], body.theta[0], body.root[0])
     assert len(at_once) > 1 and at_once[0] == max(at_once) == 256
+
+
+def test_of_frames_in_one_posture_the_one_that_stands_there_is_shown():
+    """Two frames have the same joint angles, a metre apart; 40 cm from the first is nearer to it."""
+    theta, root = torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1)
+    root[1, 0, 3] = 1.0
+    body = BodyFit(box_rig(), (0, 1), theta, root)
+    avatar = TrainedAvatar(build_field(TINY.field, body, False), body, 2.5, body)
+    between = root[0].clone()
+    between[0, 3] = 0.4
+    assert [avatar._frame_row(theta[0], place).item() for place in (*root, between)] == [0, 1, 0]

@@ -41,9 +41,11 @@ def test_distance_by_hand(by_hand: None) -> None:
 
 
 def test_small_images_are_filled_up_with_black(by_hand: None) -> None:
-    """Of 15 x 15 positions, at pixels 3, 7, ..., 59, 4 x 4 lie in an image of 16 px."""
+    """Of 15 x 15 positions, at pixels 3, 7, ..., 59, 4 x 4 lie in an image of 16 px. In the filling ReLU leaves (0, 1);
+    grey would be (.0654, .9979)."""
     small = Lpips()(WHITE[:16, :16], BLACK[:16, :16])
     assert small == pytest.approx(2.727262 * 16 / 225, abs=1e-6)
+    assert Lpips()._features(WHITE[:16, :16])[0][0, :, 14, 14].tolist() == pytest.approx([0, 1], abs=1e-6)
 
 
 def test_without_weights_it_is_null_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -23,6 +24,7 @@ from hnerf.fields.fast import (
     shown,
 )
 from hnerf.fields.rays import PosedScene, Rays
+from hnerf.geometry.camera import Camera
 from hnerf.training.losses import pixel_colour
 from tests.body.boxes import box_rig
 from tests.body.test_limbs import limbs_rig, swung
@@ -104,6 +106,28 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
     assert field.sample(scene, rays.pick(torch.tensor([1])), draws)[0].gradient_norm.shape == (0,)
     for all_three, alone in zip((alpha, colour, d, residual), sampled([0, 2]), strict=True):
         torch.testing.assert_close(all_three[[0, 2]], alone, atol=1e-6, rtol=0)
+
+
+def test_beyond_its_thickness_the_shell_sees_nothing():
+    """Cells of 5 cm put samples 7 cm and more above the box; those beyond 2 cm are out of reach."""
+    bodies, conditions = standing()
+    field = field_of(100.0)
+    field.outer_m.fill_(0.02)
+    rays = Rays(torch.tensor([[0.5, 0.4, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long))
+    draws = Draws.deterministic(1, 64, torch.device("cpu"))
+    found, depths = field.sample(field.scene(bodies, conditions), rays, draws)
+    above_m = 3.0 - depths[0] - RIG.vertices_m[:, 2].max()
+    far, close = above_m > 0.0201, (above_m > 0) & (above_m < 0.0199)
+    assert far.any() and close.any()
+    assert (found.d[0, far] == field.reach_m).all()
+    torch.testing.assert_close(found.d[0, close], above_m[close], atol=1e-4, rtol=0)
+
+
+def test_pixels_within_the_shell_and_a_cell_are_visible():
+    """7 cm and a cell of 5 cm at 210 m, with 5000 px focal length, are 2.9 px, rounded up."""
+    camera = Camera("afar", np.diag([5000.0, 5000.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
+    seen = field_of(100.0).visible_pixels(camera, 210 * np.array([[20 / 5000, 20 / 5000, 1.0]]))
+    assert np.flatnonzero(seen[20]).tolist() == [*range(17, 24)]
 
 
 def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monkeypatch: pytest.MonkeyPatch):

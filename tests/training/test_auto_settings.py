@@ -1,5 +1,6 @@
 """Automatic settings by hand, and the measurement of a scene."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -181,3 +182,13 @@ def test_a_camera_counts_by_the_masks_that_it_has(tmp_path: Path, monkeypatch: p
     assert SceneStatistics.of(capture, Masks(masks, {}), body).person_px == 1624
     del masks["3", 0], masks["3", 1]
     assert SceneStatistics.of(capture, Masks(masks, {}), body).person_px == 1424
+
+
+def test_shells_hold_99_of_100_outline_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Outlines lie 50 pixels in to 50 pixels out: the 99th percentile of -50, -49, ... 50 is 49, the first is -49."""
+    monkeypatch.setattr(auto_settings, "_outline_distance_px", lambda mask, covered: np.arange(-50.0, 51.0))
+    monkeypatch.setattr(auto_settings, "MASKS_PER_CAMERA", 1)
+    capture, masks, body = record(tmp_path)
+    scene = SceneStatistics.of(dataclasses.replace(capture, train_cameras=("0",)), masks, body)
+    assert scene.outside_m == pytest.approx(49 * scene.footprint_m)
+    assert scene.inside_m == pytest.approx(49 * scene.footprint_m)

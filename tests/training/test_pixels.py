@@ -105,6 +105,17 @@ def test_an_outline_before_an_unknown_background_is_left_out(tmp_path: Path, mon
     assert torch.equal(some.edges, torch.nonzero(some.edge)[:, 0])
 
 
+def test_edges_reach_two_pixels_in_and_out(tmp_path: Path):
+    """Around a square of 12 px: 16 x 16 px without 8 x 8."""
+    capture, masks, body = record(tmp_path)
+    square = np.zeros((SIZE_PX, SIZE_PX), bool)
+    square[10:22, 10:22] = True
+    masks.encoded["0", 0] = encode(square)
+    pixels = gather_pixels(capture, masks, body, (0,), None, {}, tmp_path, ALONE)
+    edge = pixels.edge[: SIZE_PX**2].view(SIZE_PX, SIZE_PX)
+    assert edge.sum() == 16**2 - 8**2 and edge[8:24, 8:24].sum() == edge.sum() and not edge[12:20, 12:20].any()
+
+
 def test_edges_are_found_in_every_frame(tmp_path: Path):
     capture, masks, body = record(tmp_path)
     pixels = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)

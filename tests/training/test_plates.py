@@ -48,6 +48,11 @@ def test_somebody_who_stands_still_has_no_plate() -> None:
     assert plates_of(*recording([20]), (0,)) is None
 
 
+def test_somebody_who_hides_most_of_the_own_outline_has_no_plate() -> None:
+    """Six columns apart, columns 21 to 34 are never free. Of an outline of 80 px two columns of 12 are: 30 %."""
+    assert plates_of(*recording([20, 26]), (0, 1)) is None
+
+
 def test_a_clean_plate_is_taken_as_it_is() -> None:
     clean = np.full((HEIGHT_PX, WIDTH_PX, 3), 7, np.uint8)
     (plate,) = plates_of(*recording([20], clean), (0,)) or []

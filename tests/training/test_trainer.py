@@ -210,15 +210,16 @@ def test_novel_pixels_never_reach_the_field(tmp_path: Path):
 
 
 def test_finished_poses_stay_whatever_pulls_them_to_the_fit(tmp_path: Path):
-    """While novel poses are fitted, the increment loss still covers all frames."""
-    recording, poses = record(tmp_path / "capture"), []
+    """While novel poses are fitted, the increment loss still covers all frames, and training has left momentum."""
+    recording, bodies = record(tmp_path / "capture"), []
     for steps in (0, 4):
         settings = tiny(novel_pose_steps=steps, losses=TINY.losses.model_copy(update={"increment": 1.0}))
         out = tmp_path / f"{steps}"
         out.mkdir()
         train(*recording, settings, out, ALONE)
-        poses.append(load_avatar(out).body.theta[:2])
-    torch.testing.assert_close(poses[0], poses[1], atol=1e-6, rtol=0)
+        bodies.append(load_avatar(out).body)
+    torch.testing.assert_close(bodies[0].theta[:2], bodies[1].theta[:2], atol=1e-6, rtol=0)
+    torch.testing.assert_close(bodies[0].root[:2], bodies[1].root[:2], atol=1e-6, rtol=0)
 
 
 def test_training_frames_of_one_posture_keep_one(tmp_path: Path):
