@@ -298,7 +298,7 @@ def test_scores_are_found_again_until_what_is_scored_or_how_changes(
     mesh.parent.mkdir(parents=True)
     mesh.write_text("true")
     truth = read_capture(tmp_path / "ada")[1]
-    recording, calibration, body, model = (Artifact(stage=s, root=tmp_path / s, files={}) for s in "abdc")
+    recording, calibration, body, model = (Artifact(stage=s, root=tmp_path / (32 * s), files={}) for s in "abdc")
     store = Store(tmp_path / "store")
 
     def run(truth: Source, settings: ScoringSettings) -> Artifact:
@@ -307,7 +307,7 @@ def test_scores_are_found_again_until_what_is_scored_or_how_changes(
     first = run(truth, ScoringSettings())
     assert run(truth, ScoringSettings()) == first
     assert first.metrics == {"psnr": 30.0}
-    assert counted == [tmp_path / "c"]
+    assert counted == [tmp_path / (32 * "c")]
     run(truth, ScoringSettings(images=3))
     mesh.write_text("truer")
     for stage in (tasks_module.score_training, tasks_module.score_end_of_training):
