@@ -117,17 +117,18 @@ def test_a_ray_beside_the_box_has_all_its_samples_in_the_scene() -> None:
     assert (depths.diff() >= 0).all() and depths.min() >= 1 and depths.max() <= 5
 
 
-def test_a_person_who_walks_out_of_the_scene_is_sampled() -> None:
-    """The scene, 2 m around (0, 2, 0), ends at y = 4 m. The second of two bodies stands 4 m farther along y, in a box
-    from 3.9 to 5.1 m. A ray along x through its middle is in both from -2 to 2 m; coarse samples lie at -1.5, -.5, .5
-    and 1.5 m, of which the third is in B from -.1 to 1.1 m."""
+@pytest.mark.parametrize("walk_m", [6.0, -6.0])
+def test_a_person_who_walks_out_of_the_scene_is_sampled(walk_m: float) -> None:
+    """The first of two bodies stands at y = 0, the second at 6 or -6 m, and the scene's 2 m around their middle end
+    before either. A ray along x through the second is in the scene from -2 to 2 m; coarse samples lie at -1.5, -.5, .5
+    and 1.5 m, of which the third is in B, from -.1 to 1.1 m."""
     root = torch.eye(4).repeat(2, 1, 1)
-    root[1, 1, 3] = 4.0
+    root[1, 1, 3] = walk_m
     field = PaperField(RIG, root, SETTINGS, static=False)
     field.radiance, field.residual = Fog(), Slope()
     standing = PosedBodies(RIG, 0 * THETA, root, RIG.vertices_m)
     conditions = Conditions.of(RIG, 0 * THETA, root, torch.arange(2), 2.0)
-    ray = replace(RAY, origins_m=torch.tensor([[-3.0, 4.5, 0.5]]))
+    ray = replace(RAY, origins_m=torch.tensor([[-3.0, walk_m + 0.5, 0.5]]))
     samples, depths = field.sample(field.scene(standing, conditions), ray, DRAWS)
     assert depths.min() >= 1 and depths.max() <= 5
     within = (depths > 2.9) & (depths < 4.1)
