@@ -25,15 +25,15 @@ CLOSE = 0.7  # of difflib: keys that are taken for misspelled ones
 class Section(BaseModel):
     """Settings of one stage: frozen, without unknown keys or values outside their type.
 
-    beside_the_result: names of those on which the stage's result does not depend.
+    excluded_from_key: names of those that the stage's cache key leaves out, since its result does not depend on them.
     """
 
-    beside_the_result: ClassVar[tuple[str, ...]] = ()
+    excluded_from_key: ClassVar[tuple[str, ...]] = ()
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    def deciding(self) -> dict[str, Any]:
-        """Return the settings on which the stage's result depends."""
-        return self.model_dump(exclude=set(self.beside_the_result))
+    def key_values(self) -> dict[str, Any]:
+        """Return the settings on which the stage's result depends, for its cache key."""
+        return self.model_dump(exclude=set(self.excluded_from_key))
 
 
 class CaptureSettings(Section):
@@ -77,7 +77,7 @@ class CalibrationSettings(Section):
 class SegmentationSettings(Section):
     """Settings of the masks."""
 
-    beside_the_result: ClassVar[tuple[str, ...]] = ("rounds", "still_px")  # of the flow, which repeats the stage
+    excluded_from_key: ClassVar[tuple[str, ...]] = ("rounds", "still_px")  # of the flow, which repeats the stage
     shadow_chroma: float = Field(default=0.01, gt=0)  # std of log colour ratios in a shadow, beyond noise
     darkest_shadow: float = Field(default=0.3, gt=0, lt=1)  # share of the brightness that is left in the deepest shadow
     reach: float = Field(default=0.13, gt=0)  # of clothes and hair from limbs, in heights of the person
@@ -245,7 +245,7 @@ AnyFieldSettings = (
 class TrainingSettings(Section):
     """Settings of training: the field with its own settings, the losses and the optimisation."""
 
-    beside_the_result: ClassVar[tuple[str, ...]] = ("processes", "memory_gib")  # but for the order of sums
+    excluded_from_key: ClassVar[tuple[str, ...]] = ("processes", "memory_gib")  # but for the order of sums
     field: AnyFieldSettings = Field(default=FastFieldSettings(), discriminator="kind")
     losses: LossSettings = LossSettings()
     steps: int = Field(default=0, ge=0)  # 0: chosen from the scene
@@ -280,7 +280,7 @@ class TrainingSettings(Section):
 class EvaluationSettings(Section):
     """Settings of the evaluation and its report."""
 
-    beside_the_result: ClassVar[tuple[str, ...]] = ("holdout",)  # of the flow, which names the camera to the stage
+    excluded_from_key: ClassVar[tuple[str, ...]] = ("holdout",)  # of the flow, which names the camera to the stage
     max_meshes: int = Field(default=4, ge=1)  # per split
     max_images: int | None = Field(default=None, ge=1)  # per split; None: all
     report_rows: int = Field(default=3, ge=1)  # frames shown of each split

@@ -63,8 +63,8 @@ def evaluate_held_out(
     camera: str,
     settings: EvaluationSettings,
 ) -> dict[str, float]:
-    """Score an avatar on a camera, under its own masks. Recording, calibration and segmentation
-    include that camera; body and training were made without it."""
+    """Score an avatar on a camera, under its own masks. Recording, calibration and segmentation include that camera;
+    body and training were made without it."""
     capture, masks = calibrated_capture(recording, calibration), Masks.load(segmentation.root)
     avatar, fitted = load_trained_avatar(training), BodyFit.load(body.root)
     return _headline(score_held_out(capture, masks, avatar, fitted, training.root, camera, settings, out))

@@ -48,7 +48,7 @@ def _key_value(value: Input | int) -> Any:
     if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, Section):
-        return value.deciding()
+        return value.key_values()
     if isinstance(value, Source) and not value.is_truth:  # a person may be called as the folder is
         return [value.name, value.digest]
     return value.digest

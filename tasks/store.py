@@ -137,8 +137,8 @@ class Store:
         inputs: Iterable[str] = (),
         checkpoint: str = "",
     ) -> Artifact:
-        """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics, of which
-        those that are finite are kept.
+        """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics, of which those that
+        are finite are kept.
 
         If several callers want the same artifact, one computes it and the others wait. The folder of a resumable stage
         survives a crash, and the next call resumes in it; any other starts empty. Links that lie in the way are not

@@ -12,7 +12,7 @@ from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.picture import draw_cameras
 from hnerf.calibration.sheet import draw_evidence
 from hnerf.calibration.synchronise import Timing
-from hnerf.capture.capture import Capture, possible
+from hnerf.capture.capture import Capture, checked_capture
 from hnerf.capture.formats.easymocap import read_easymocap, write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.errors import InputError
@@ -149,5 +149,5 @@ def load_cameras(out: Path, capture: Capture) -> Capture:
     train_cameras = tuple(name for name in capture.train_cameras if name in cameras)
     found = json.loads((out / "report.json").read_text())["cameras"]
     offsets = {name: found[name]["frame_offset"] for name in train_cameras if found[name]["frame_offset"]}
-    used = possible(dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras))
+    used = checked_capture(dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras))
     return used.synchronised(offsets) if offsets else used

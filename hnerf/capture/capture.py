@@ -214,7 +214,7 @@ class Capture:
         plain["picture_areas_px"] = {name: Area(*area) for name, area in plain.get("picture_areas_px", {}).items()}
         if point := plain.get("subject_point"):
             plain["subject_point"] = SubjectPoint(tuple(point[0]), *point[1:])
-        return possible(Capture(root=root, cameras=cameras, **plain))
+        return checked_capture(Capture(root=root, cameras=cameras, **plain))
 
 
 def _camera(source: Path, name: str, described: dict[str, Any]) -> Camera:
@@ -224,7 +224,7 @@ def _camera(source: Path, name: str, described: dict[str, Any]) -> Camera:
     return Camera(name, lens.K, lens.R, lens.t_m, *check_image_size(source, *described["size_px"]))
 
 
-def possible(capture: Capture) -> Capture:
+def checked_capture(capture: Capture) -> Capture:
     """Return a capture as it is. Raises ValueError unless it has training cameras, all its cameras are known, it has a
     frame rate, and a vertical axis."""
     if not capture.train_cameras or not {*capture.train_cameras, *capture.test_cameras} <= capture.cameras.keys():

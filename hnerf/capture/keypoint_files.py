@@ -92,10 +92,10 @@ def _people(path: Path, triples: list[Any]) -> np.ndarray:
     if not np.isfinite(points).all():
         raise InputError(f"{path}: a keypoint is NaN or infinite; detect them again")
     points[..., 2] = points[..., 2].clip(0, 1)  # some detectors exceed 1, and COCO's own annotations reach 2
-    return within_reach(path, points)
+    return without_far_points(path, points)
 
 
-def within_reach(path: Path, points: np.ndarray) -> np.ndarray:
+def without_far_points(path: Path, points: np.ndarray) -> np.ndarray:
     """Return keypoints (..., 3), those beyond MAX_PX zero. Raises InputError if one of them was seen."""
     far = (np.abs(points[..., :2]) > MAX_PX).any(-1)
     if (points[far][:, 2] > 0).any():

@@ -24,7 +24,7 @@ NAME = "checkpoint.pt"
 def training_key(capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings) -> str:
     """Return a digest of what a training is made from, by which its checkpoint is known; of images, only which there
     are, because the body was fitted to them."""
-    digest = hashlib.sha256(f"{settings.deciding()} {capture.name} {capture.train_frames}".encode())
+    digest = hashlib.sha256(f"{settings.key_values()} {capture.name} {capture.train_frames}".encode())
     for camera in capture.cameras.values():
         digest.update(f"{camera.name} {camera.width_px} {camera.height_px}".encode())
         for numbers in (camera.K, camera.R, camera.t_m):

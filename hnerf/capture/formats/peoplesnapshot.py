@@ -14,7 +14,7 @@ import numpy as np
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
-from hnerf.capture.keypoint_files import within_reach
+from hnerf.capture.keypoint_files import without_far_points
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, path_in_capture
 from hnerf.capture.safe_pickle import read_pickle
@@ -64,8 +64,8 @@ class PeopleSnapshot(Layout):
         if not path.exists():
             return {}
         count = self._one_a_frame(path, "keypoints")
-        found = within_reach(path, _array(path, "keypoints", (3 * COCO_POINTS,)).reshape(count, 1, COCO_POINTS, 3))
-        return {i: StoredFrame(path, points.copy) for i, points in enumerate(found)}
+        found = _array(path, "keypoints", (3 * COCO_POINTS,)).reshape(count, 1, COCO_POINTS, 3)
+        return {i: StoredFrame(path, points.copy) for i, points in enumerate(without_far_points(path, found))}
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return the frames of masks.hdf5: masks (N, H, W), 0 outside the person."""
