@@ -42,6 +42,7 @@ log = logging.getLogger("hnerf.store")
 
 RECORDING = ".recording"  # under subjects/<name>: digest and folder of the recording
 SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving", ".shared")  # of what a key may have beside its lock
+MAX_RECORD_BYTES = 256_000_000  # a million files need half of that
 ATTEMPTS = 100  # to lock a key in a folder that others make and remove
 # In order: each stage is computed from those before it.
 STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
@@ -117,9 +118,9 @@ class Store:
 
     def recorded(self, stage: str, key: str) -> Artifact | None:
         """Return the artifact as its record describes it, whose files were not looked at; None if the record cannot be
-        read as one, or is a link. Raises FileNotFoundError if there is none."""
+        read as one, is a link, or has more bytes than one needs. Raises FileNotFoundError if there is none."""
         record, root = self.path(stage, key, ".json"), self.path(stage, key)
-        if record.is_symlink() or root.is_symlink():
+        if record.is_symlink() or root.is_symlink() or record.stat().st_size > MAX_RECORD_BYTES:
             return None
         try:
             artifact = Artifact.model_validate({"root": root, **json.loads(record.read_bytes())})

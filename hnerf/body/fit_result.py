@@ -50,8 +50,11 @@ class BodyFit:
 
     @staticmethod
     def load(folder: Path) -> "BodyFit":
-        """Read what `save` wrote."""
+        """Read what `save` wrote. Raises ValueError if its arrays do not fit each other."""
         with np.load(folder / "body.npz", allow_pickle=False) as stored:
             frames = tuple(int(f) for f in stored["frames"])
             theta, root = torch.from_numpy(stored["theta"]), torch.from_numpy(stored["T"])
-        return BodyFit(Rig.load(folder / "rig.npz"), frames, theta, root)
+        rig, count = Rig.load(folder / "rig.npz"), len(frames)
+        if theta.shape != (count, len(rig.joints_m), 3) or root.shape != (count, 4, 4):
+            raise ValueError(f"theta {tuple(theta.shape)}, T {tuple(root.shape)} are not {count} poses of its rig")
+        return BodyFit(rig, frames, theta, root)

@@ -8,7 +8,7 @@ SMPL, Loper et al. 2015), so every rest orientation is the identity.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,13 @@ import torch
 from torch import Tensor
 
 from hnerf.body.limbs import Limbs
+
+AXES = {  # of the arrays of Rig, as its docstring names them; P keypoints
+    "vertices_m": "V3", "faces": "F3", "joints_m": "J3", "joint_names": "J", "parents": "J", "beta": "B",
+    "beta_names": "B", "shape_basis": "BV3", "joint_basis": "BJ3", "skin_joints": "VK", "skin_weights": "VK",
+    "free": "J", "keypoint_weights": "PV",
+}  # fmt: skip
+INDICES = {"faces": "V", "parents": "J", "skin_joints": "J"}  # what the values of these count
 
 
 @dataclass(frozen=True)
@@ -92,8 +99,9 @@ class Rig:
 
     @staticmethod
     def load(path: Path) -> "Rig":
-        """Read what `save` wrote."""
+        """Read what `save` wrote. Raises ValueError if its arrays do not fit each other."""
         with np.load(path, allow_pickle=False) as stored:
+            _require_agreement({f.name: stored[f.name] for f in dataclasses.fields(Rig)})
             values: dict[str, Any] = {
                 f.name: tuple(map(str, stored[f.name]))
                 if f.name in ("joint_names", "beta_names")
@@ -101,6 +109,18 @@ class Rig:
                 for f in dataclasses.fields(Rig)
             }
         return Rig(**values)
+
+
+def _require_agreement(arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise ValueError, naming the array, if one has other axes than AXES says, or an index beyond the others."""
+    sizes = {"3": 3}
+    for name, axes in AXES.items():
+        shape = arrays[name].shape
+        if len(shape) != len(axes) or any(sizes.setdefault(a, n) != n for a, n in zip(axes, shape, strict=True)):
+            raise ValueError(f"{name} has shape {shape}")
+    for name, counted in INDICES.items():
+        if not (arrays[name] < sizes[counted]).all():
+            raise ValueError(f"{name} has an index beyond {sizes[counted]}")
 
 
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:

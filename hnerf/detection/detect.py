@@ -143,8 +143,7 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> float
             masks=_by_frame(everybody, lambda person: person.mask, (SIZE, SIZE), np.uint8),
             regions=_by_frame(everybody, lambda person: np.array([*person.region.centre_px, *person.region[1:]]), (4,)),
         )
-        file.flush()
-        os.fsync(file.fileno())
+    os.sync()  # the masks as well: this file says that they are whole
     os.replace(beside, path)
     return 1e3 * (time.perf_counter() - started) / len(capture.frames)
 

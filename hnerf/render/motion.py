@@ -108,9 +108,8 @@ def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
     turn = torch.eye(4)
     turn[:3, :3] = _rotation_between_up_axes(motion.up, up)
     placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)
-    hips_m = _hips_m(other) @ turn[:3, :3].T  # rigs have them at other places in the body frame, which pitches
-    hips_m += _hips_m(own).mean(0) - hips_m.mean(0)
-    placed = _translated(placed, hips_m - _hips_m(placed))
+    hips_m = middle_of_hips_m(other) @ turn[:3, :3].T
+    placed = set_middle_of_hips(placed, hips_m + middle_of_hips_m(own).mean(0) - hips_m.mean(0))
     lowest_m = lowest_points_m(other, motion.up)
     above_floor_m = lowest_m - lowest_m.quantile(BELOW_FLOOR)  # of a motion that may be in the air half of the time
     return set_lowest_points(placed, above_floor_m + lowest_points_m(own, up).quantile(0.5), up)
@@ -131,6 +130,21 @@ def interpolate_poses(body: BodyFit, first: int, last: int, count: int) -> BodyF
     return BodyFit(body.rig, tuple(range(count)), torch.from_numpy(theta).to(body.theta), root)
 
 
+def middle_of_hips_m(body: BodyFit) -> Tensor:
+    """Return the middle of the hip joints, (n, 3), in the world; the root joint of a rig without legs."""
+    hips = [j for j, name in enumerate(body.rig.joint_names) if name in HIPS] or [0]
+    return joint_transforms(body.rig, body.theta, body.root)[:, hips, :3, 3].mean(1)
+
+
+def set_middle_of_hips(body: BodyFit, points_m: Tensor) -> BodyFit:
+    """Return the same poses, translated so that the middle of the hip joints is at `points_m` (n, 3).
+
+    Rigs have it at different places in the body frame: about that frame's origin, hips and standing feet would slide
+    while the trunk bends.
+    """
+    return _translated(body, points_m - middle_of_hips_m(body))
+
+
 def lowest_points_m(body: BodyFit, up: str) -> Tensor:
     """Return the height (n,) of each pose's lowest vertex along the world's axis `up`."""
     poses = zip(body.theta, body.root, strict=True)  # one at a time: all vertices at once would fill the memory
@@ -147,12 +161,6 @@ def _translated(body: BodyFit, move_m: Tensor) -> BodyFit:
     root = body.root.clone()
     root[:, :3, 3] += move_m
     return dataclasses.replace(body, root=root)
-
-
-def _hips_m(body: BodyFit) -> Tensor:
-    """Return the middle of the hip joints, (n, 3), in the world; the root joint of a rig without legs."""
-    hips = [j for j, name in enumerate(body.rig.joint_names) if name in HIPS] or [0]
-    return joint_transforms(body.rig, body.theta, body.root)[:, hips, :3, 3].mean(1)
 
 
 def _rotation_between_up_axes(from_up: str, to_up: str) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.errors import InputError
-from hnerf.render.motion import lowest_points_m, set_lowest_points
+from hnerf.render.motion import lowest_points_m, middle_of_hips_m, set_lowest_points, set_middle_of_hips
 
 MAX_FOLDED_SHARE = 0.005  # of the triangles; half a per cent turned over is not visible
 THICKNESS_RANGE = -0.9, 2.0  # allowed change of thickness, as a share of the distance from bone to skin
@@ -79,9 +79,10 @@ def volume_m3(rig: Rig) -> float:
 
 
 def transfer_poses(rig: Rig, body: BodyFit, up: str) -> BodyFit:
-    """Return the poses of `body` on a reshaped rig, each with its lowest point as high as before along the world's axis
-    `up`."""
-    return set_lowest_points(BodyFit(rig, body.frames, body.theta, body.root), lowest_points_m(body, up), up)
+    """Return the poses of `body` on a reshaped rig: the hips stay where they are, save that each pose's lowest point is
+    to be as high as before along the world's axis `up`."""
+    reshaped = set_middle_of_hips(dataclasses.replace(body, rig=rig), middle_of_hips_m(body))
+    return set_lowest_points(reshaped, lowest_points_m(body, up), up)
 
 
 def _require_unfolded(shaped: Rig, rig: Rig, title: str) -> Rig:

@@ -8,7 +8,7 @@ import torch
 from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
 from hnerf.body.rig import Rig
 from hnerf.errors import InputError
-from hnerf.render.motion import lowest_points_m
+from hnerf.render.motion import HIPS, lowest_points_m, middle_of_hips_m
 from hnerf.render.shape import offsets_from_bones_m, transfer_poses, volume_m3, with_shape_values, with_volume
 from tests.asset.figure import bending_body, column_rig
 from tests.body.two_bone import two_bone_rig
@@ -97,6 +97,19 @@ def test_another_shape_stands_on_the_same_floor() -> None:
     longer = transfer_poses(with_shape_values(body.rig, {"length": 0.5}), body, "z")
     torch.testing.assert_close(lowest_points_m(longer, "z"), torch.full((4,), 0.5))
     torch.testing.assert_close(longer.root[:, :2], body.root[:, :2])
+
+
+def test_a_trunk_that_pitches_leaves_the_hips_of_another_shape_where_they_are() -> None:
+    """The hip is 0.8 m above the origin of the body frame, of the longer body 1.2 m. A quarter turn about x takes it
+    from (0, 0, z) to (0, -z, 0): without a shift, 0.4 m further back."""
+    body, rig = bending_body(), changeable_rig()
+    rig = dataclasses.replace(rig, joint_names=("root", HIPS[0]))
+    rig.joint_basis[1, 1, 2] = 0.8
+    body.root[0, :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    body = dataclasses.replace(body, rig=rig)
+    longer = transfer_poses(with_shape_values(rig, {"length": 0.5}), body, "z")
+    torch.testing.assert_close(middle_of_hips_m(longer)[:, :2], middle_of_hips_m(body)[:, :2])
+    assert longer.root[0, 1, 3] - body.root[0, 1, 3] == pytest.approx(0.4, abs=1e-5)
 
 
 def test_what_is_beyond_the_end_of_its_bone_is_away_from_that_end() -> None:

@@ -282,15 +282,32 @@ def test_a_copy_that_parses_and_makes_no_sense_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_copy_with_faces_that_are_none_is_one_line(
-    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("file", "name", "array", "message"),
+    [
+        ("rig.npz", "faces", np.zeros(3, int), "faces has shape (3,)"),
+        ("rig.npz", "faces", np.full((1, 3), 10**6), "faces has an index beyond "),
+        ("rig.npz", "joints_m", np.zeros((2, 4)), "joints_m has shape (2, 4)"),
+        ("rig.npz", "parents", np.array([-1]), "parents has shape (1,)"),
+        ("body.npz", "theta", np.zeros((1, 2, 3)), "theta (1, 2, 3), T "),
+        ("body.npz", "T", np.zeros((4, 4)), ", T (4, 4) are not "),
+    ],
+)
+def test_a_copy_whose_arrays_do_not_fit_each_other_is_one_line(
+    file: str,
+    name: str,
+    array: np.ndarray,
+    message: str,
+    subject: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     copy = shutil.copytree(subject, tmp_path / "copy")
-    with np.load(copy / "training/rig.npz") as stored:
-        np.savez(copy / "training/rig.npz", **{**stored, "faces": np.zeros(3, int)})
+    with np.load(copy / "training" / file) as stored:
+        np.savez(copy / "training" / file, **{**stored, name: array})
     assert main(["render", str(copy), "--out", str(tmp_path / "out")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"hnerf: {copy / 'training'}: damaged, or written by another version (")
+    assert line.startswith(f"hnerf: {copy / 'training'}: damaged, or written by another version (") and message in line
 
 
 def test_a_motion_of_another_version_is_one_line(

@@ -160,6 +160,13 @@ def test_a_record_that_is_none_is_made_again(tmp_path: Path, text: str) -> None:
     assert Store(tmp_path).get_or_compute("fit", "k", write_abc) == made
 
 
+def test_a_record_of_gigabytes_is_not_read(tmp_path: Path) -> None:
+    """Of a file that occupies nothing."""
+    made = Store(tmp_path).get_or_compute("fit", "k", write_abc)
+    os.truncate(tmp_path / "fit" / "k.json", 10**13)
+    assert Store(tmp_path).get_or_compute("fit", "k", write_abc) == made
+
+
 def test_links_planted_in_the_store_are_not_followed(tmp_path: Path) -> None:
     victim, fit = tmp_path / "victim", tmp_path / "store" / "fit"
     (victim / "deep").mkdir(parents=True)
