@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hnerf.capture.normalise import UNDISTORTED
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import reprojection_px, triangulate
@@ -125,7 +126,8 @@ def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], shared: np.ndarr
             continue
         seen, K = keypoints[i, :, 2] > 0, camera.K
         distorted = np.ascontiguousarray(keypoints[i, seen, None, :2])
-        straight[i, seen, :2] = cv2.undistortPoints(distorted, K, np.array([k1, 0, 0, 0]), P=K)[:, 0]
+        k = np.array([k1, 0, 0, 0])
+        straight[i, seen, :2] = cv2.undistortPoints(distorted, K, k, P=K, criteria=UNDISTORTED)[:, 0]
     return straight
 
 
