@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration import outline_adjustment, silhouettes
-from hnerf.calibration.outline_adjustment import _turned, _zoomed_about, adjust_to_outlines
+from hnerf.calibration.outline_adjustment import _turned, _zoomed_about, adjust_to_outlines, follow_outlines
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import ring, turned
@@ -86,6 +86,15 @@ def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(
     assert "; then fitted to outlines: those of held-out frames go from" in both.reasons["c2"]
     exact = refined(tmp_path / "c", given, keypoints_of(0), outlines())
     assert "outlines" not in exact.reasons["c2"] and off_px(exact.cameras)[2] < 0.1
+
+
+def test_without_two_outlines_at_one_of_the_fitted_instants_cameras_stay() -> None:
+    """The fit is to the first of two instants, at which only one camera has an outline."""
+    seen = outlines().by_camera
+    halves = Outlines({"c0": [None, seen["c0"][1]], "c1": list(seen["c1"][:2])}, (0, 1))
+    given = ring(2)
+    found, gain = follow_outlines(halves, given, ["c0", "c1"], np.tile(MIDDLE_M, (2, 25, 1)), 0.02)
+    assert gain == "" and all(a is b for a, b in zip(found, given, strict=True))
 
 
 def test_a_zoomed_camera_sees_the_person_at_the_same_place_and_size() -> None:
