@@ -37,7 +37,8 @@ class Track(NamedTuple):
 
 class PairClock(NamedTuple):
     """The clock of camera b by that of camera a: t_b = rate t_a + offset_s. error_s: standard error of the offset in
-    the middle of what both recorded; clear: the residual as a share of that of the next best offset."""
+    the middle of what both recorded; rate_error: of the rate, at most MAX_DRIFT_ERROR; clear: the residual as a share
+    of that of the next best offset."""
 
     offset_s: float
     rate: float
@@ -141,7 +142,8 @@ def pair_clock(a: _Path, b: _Path, fundamental: np.ndarray | None = None, near_s
     error = np.sqrt(drifting.covariance.diagonal())
     if error[1] < MAX_DRIFT_ERROR and abs(drifting.rate - 1) > DRIFT_SIGMAS * error[1]:
         return PairClock(drifting.offset_s, drifting.rate, float(error[0]), float(error[1]), clear)
-    return PairClock(best.offset_s, 1.0, float(np.sqrt(best.covariance[0, 0])), 0.0, clear)
+    rate_error = min(float(error[1]), MAX_DRIFT_ERROR)  # unknown is not none: other pairs may tell
+    return PairClock(best.offset_s, 1.0, float(np.sqrt(best.covariance[0, 0])), rate_error, clear)
 
 
 def _unit_fundamental(fundamental: np.ndarray, a: _Path, b: _Path) -> np.ndarray:

@@ -71,6 +71,21 @@ def test_a_pair_that_contradicts_two_others_hardly_counts() -> None:
     np.testing.assert_allclose(x, [0, 1, 2, 3], atol=0.01)
 
 
+def test_a_drift_that_two_cameras_show_outlasts_a_third_that_tells_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """b drifts by 400 +- 10 ppm against a; c recorded too briefly, and tells 0 +- 100 ppm of both. Then c is halfway,
+    and (b - 400)^2 / 10^2 + 2 (b / 2)^2 / 100^2 is least at b = 400 / 1.005."""
+    short = pair_clock(smoothed(filmed(0, 5, 0.0)), smoothed(filmed(2, 5, 0.5)))
+    assert (short.rate, short.rate_error) == (1.0, pytest.approx(1e-4))
+    drifting = short._replace(offset_s=0.0, rate=1 + 4e-4, rate_error=1e-5)
+    monkeypatch.setattr("hnerf.calibration.clocks.estimate.smoothed", lambda track: track)
+    monkeypatch.setattr(
+        "hnerf.calibration.clocks.estimate.pair_clock", lambda a, b, *_: drifting if a + b == "ab" else short
+    )
+    found = estimate_clocks({name: name for name in "abc"})
+    assert 1e6 * (found.clocks["b"].rate - 1) == pytest.approx(398, abs=1)
+    assert 1e6 * (found.clocks["c"].rate - 1) == pytest.approx(199, abs=1)
+
+
 def test_a_drift_of_200_ppm_in_five_minutes() -> None:
     found = pair_clock(smoothed(filmed(0, 300, 0.0)), smoothed(filmed(1, 300, 12.34, 2e-4)))
     assert 1e6 * (found.rate - 1) == pytest.approx(200, abs=10)
