@@ -38,12 +38,18 @@ def estimate_clocks(
     """Return the clocks of the cameras from the subject's keypoints.
 
     cameras: where they are calibrated, in the pixels of the keypoints. near_s: offsets of pairs that are known to half
-    a second, from the sound. Raises InputError naming a camera that no pair links to the first.
+    a second, from the sound. Raises InputError naming a camera that never shows the person, or that no pair links
+    to the first.
     """
     names = list(tracks)
     if len(names) < 2:
         raise InputError("one recording has nothing to be synchronised with; film with two cameras or more")
-    paths = {name: smoothed(track) for name, track in tracks.items()}
+    paths = {}
+    for name, track in tracks.items():
+        try:
+            paths[name] = smoothed(track)
+        except InputError as error:
+            raise InputError(f"camera {name}: {error}") from None
     pairs, refused = dict[tuple[str, str], PairClock](), dict[tuple[str, str], str]()
     for a, b in combinations(names, 2):
         F = fundamental(cameras[a], cameras[b]) if cameras else None

@@ -147,6 +147,13 @@ def test_one_camera_and_a_person_who_is_still_are_refused() -> None:
         estimate_clocks(still)
 
 
+def test_a_camera_that_never_shows_the_person_is_named() -> None:
+    seen, unseen = filmed(0, 1.0, 0.0), filmed(1, 1.0, 0.0)
+    unseen.keypoints[..., 2] = 0
+    with pytest.raises(InputError, match=r"^camera c1: the person is seen in fewer than three frames"):
+        estimate_clocks({"c0": seen, "c1": unseen})
+
+
 def heard(rng: np.random.Generator, dry: np.ndarray, delay: int) -> np.ndarray:
     """Return a dry sound after `delay` samples, with noise and 30 echoes of its own corner of a room, which together
     are as loud as itself and die down by 60 dB in 0.4 s."""
