@@ -171,14 +171,17 @@ def _solve_shared_lens(
 
 
 def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keypoints_px: np.ndarray) -> None:
-    """Add a camera with one focal length to the scene; y is scaled by the pixel aspect ratio fx / fy."""
+    """Add a camera with one focal length to the scene; y is scaled by the pixel aspect ratio fx / fy, and
+    skew is taken out."""
     aspect = np.array([1, camera.K[0, 0] / camera.K[1, 1]])
     fx, cx, cy = camera.K[0, 0], camera.K[0, 2], camera.K[1, 2] * aspect[1]
     size = {"width": camera.width_px, "height": camera.height_px}
     scene.add_camera_with_trivial_rig(
         pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", params=[fx, cx, cy], **size)
     )
-    image = pycolmap.Image(camera.name, np.ascontiguousarray(keypoints_px * aspect), number, number)
+    skewed_px = camera.K[0, 1] / camera.K[1, 1] * (keypoints_px[:, 1:] - camera.K[1, 2])
+    points = (keypoints_px - np.pad(skewed_px, ((0, 0), (0, 1)))) * aspect
+    image = pycolmap.Image(camera.name, np.ascontiguousarray(points), number, number)
     scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hnerf.capture.formats.easymocap import EasyMocap
-from hnerf.capture.lens import Lens, checked_lens, known_size
+from hnerf.capture.lens import MAX_SKEW_PX, Lens, checked_lens, known_size
 from hnerf.capture.safe_io import check_camera_name, path_in_capture, read_bytes, read_text
 from hnerf.errors import InputError
 from hnerf.pycolmap_import import pycolmap
@@ -84,7 +84,7 @@ class Colmap(EasyMocap):
 
 def write_colmap(out: Path, lenses: Sequence[Lens]) -> None:
     """Write `sparse/0` as text, with an image `<camera>/000000.jpg` for each camera and no points. Raises InputError on
-    a lens without size."""
+    a lens without size, or with skew, which COLMAP's models lack."""
     model = pycolmap.Reconstruction()
     for number, lens in enumerate(lenses, start=1):
         name, parameters = _colmap_parameters(lens)
@@ -102,6 +102,8 @@ def write_colmap(out: Path, lenses: Sequence[Lens]) -> None:
 def _colmap_parameters(lens: Lens) -> tuple[str, list[float]]:
     """Return the simplest model that can express the lens, and its parameters."""
     K, distortion = lens.K, lens.distortion.tolist()
+    if abs(K[0, 1]) > MAX_SKEW_PX:
+        raise InputError(f"camera {lens.name}: has skew, which COLMAP's models lack; export another format")
     linear = [K[0, 0], K[1, 1], K[0, 2] + PIXEL_CENTRE, K[1, 2] + PIXEL_CENTRE]
     if not any(distortion):
         return "PINHOLE", linear

@@ -11,7 +11,7 @@ import pytest
 
 from flows.cli import main
 from hnerf.capture.formats.caliscope import Caliscope
-from hnerf.capture.formats.colmap import Colmap
+from hnerf.capture.formats.colmap import Colmap, write_colmap
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.formats.layout import Layout
@@ -138,6 +138,12 @@ def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path) -> None:
     names = ("cam_01", "cam_08", "cam_10")
     write_cameras(tmp_path, [dataclasses.replace(a, name=b) for a, b in zip(LENSES, names, strict=True)], "caliscope")
     assert list(recognise(tmp_path).lenses()) == ["cam_0", "cam_1", "cam_2"]
+
+
+def test_skew_is_not_written_where_colmap_has_none(tmp_path: Path) -> None:
+    K = np.array([[1000.0, 40, 500], [0, 1000, 500], [0, 0, 1]])  # 40 px at one focal length off the axis
+    with pytest.raises(InputError, match="camera 01: has skew"):
+        write_colmap(tmp_path, [Lens("01", K, np.zeros(4), np.eye(3), np.zeros(3), (1000, 1000))])
 
 
 def test_colmap_sees_the_same_pixels(tmp_path: Path) -> None:
