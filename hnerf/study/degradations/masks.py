@@ -1,4 +1,8 @@
-"""Degradations of masks: too small, too large, with holes, or without a limb."""
+"""Degradations of masks: too small, too large, with holes, or without a limb.
+
+They raise NotApplicableError where no mask would differ, as where a share of a small image's width is less than a
+pixel: scores would only repeat those of the reference.
+"""
 
 from collections.abc import Callable
 
@@ -20,17 +24,17 @@ MaskChange = Callable[[str, int, np.ndarray], np.ndarray]
 
 def erode(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
     """Remove the mask's pixels within this percentage of the image's width of its edge."""
-    return _changed(masks, lambda _, __, mask: _edge_distance_px(mask) > percent / 100 * mask.shape[1])
+    return _changed(masks, capture, lambda _, __, mask: _edge_distance_px(mask) > percent / 100 * mask.shape[1])
 
 
 def dilate(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
     """Add the pixels within this percentage of the image's width of the person."""
-    return _changed(masks, lambda _, __, mask: _edge_distance_px(~mask) <= percent / 100 * mask.shape[1])
+    return _changed(masks, capture, lambda _, __, mask: _edge_distance_px(~mask) <= percent / 100 * mask.shape[1])
 
 
 def cut_holes(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
     """Remove discs at random places until this percentage of each mask is gone."""
-    return _changed(masks, lambda _, __, mask: _with_holes(mask, percent / 100, rng))
+    return _changed(masks, capture, lambda _, __, mask: _with_holes(mask, percent / 100, rng))
 
 
 def cut_limb(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
@@ -47,12 +51,19 @@ def cut_limb(masks: Masks, capture: Capture, percent: float, rng: np.random.Gene
         person = keypoints[camera][capture.frames.index(frame)]
         return mask & ~_limb(person, limb, mask.shape) if hit else mask
 
-    return _changed(masks, cut)
+    return _changed(masks, capture, cut)
 
 
-def _changed(masks: Masks, change: MaskChange) -> Masks:
-    views = sorted(masks.encoded)
-    return Masks({view: encode(change(*view, masks.get(*view))) for view in views}, masks.report)
+def _changed(masks: Masks, capture: Capture, change: MaskChange) -> Masks:
+    changed, differ = dict[tuple[str, int], bytes](), False
+    for view in sorted(masks.encoded):
+        before = masks.get(*view)
+        after = change(*view, before)
+        changed[view] = encode(after)
+        differ = differ or not np.array_equal(before, after)
+    if not differ:
+        raise NotApplicableError(f"{capture.name}: no mask would differ; its images are too small or too few for this")
+    return Masks(changed, masks.report)
 
 
 def _edge_distance_px(mask: np.ndarray) -> np.ndarray:

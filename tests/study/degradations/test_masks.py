@@ -5,6 +5,7 @@ import pytest
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
+from hnerf.errors import NotApplicableError
 from hnerf.study.degradations.catalogue import Degradation
 from tests.study.recording import write_recording
 
@@ -36,6 +37,15 @@ def test_three_per_cent_of_the_width_are_three_pixels(tmp_path: Path) -> None:
     assert dilated.sum() == 40 * 40 + 4 * 40 * 3 + 4 * 4
 
 
+@pytest.mark.parametrize("kind", ["mask_eroded", "mask_dilated"])
+def test_less_than_a_pixel_changes_no_mask_and_is_left_out(kind: str, tmp_path: Path) -> None:
+    """Take 0.9 % of 100 px: the nearest pixels across an edge are 1 px apart. 1 % takes or adds one ring."""
+    with pytest.raises(NotApplicableError, match="ada: no mask would differ"):
+        changed(tmp_path, kind, 0.9)
+    ringed, _ = changed(tmp_path, kind, 1)
+    assert ringed.sum() == (38 * 38 if kind == "mask_eroded" else 40 * 40 + 4 * 40)
+
+
 def test_holes_take_their_share_and_no_more_than_a_disc_over(tmp_path: Path) -> None:
     pierced = changed(tmp_path, "mask_holes", 25)
     disc = 60  # radius of 0.1 x 40 = 4 px
@@ -61,7 +71,8 @@ def test_a_limb_is_cut_off_around_its_bone(tmp_path: Path) -> None:
     assert (columns.min(), columns.max()) == pytest.approx((36, 59), abs=1)
 
 
-def test_no_limb_is_missing_from_no_masks(tmp_path: Path) -> None:
+def test_limbs_that_chance_leaves_on_all_masks_are_left_out(tmp_path: Path) -> None:
+    """Cut limbs from 1 % of two masks with seed 0, which draws .64 and .04."""
     capture = write_recording(tmp_path)
-    spared = Degradation(kind="mask_limb", strength=1e-9, seed=0).apply(masks(), capture)
-    assert np.array_equal(spared.get("01", 2), masks().get("01", 2))
+    with pytest.raises(NotApplicableError, match="ada: no mask would differ"):
+        Degradation(kind="mask_limb", strength=1, seed=0).apply(masks(), capture)
