@@ -83,6 +83,34 @@ def test_the_first_method_is_ahead() -> None:
     assert verdict(synthetic_result("ahead", nerf={2: (20.0, 0.1, 0.0)})).startswith("no: ")
 
 
+def without_fast(check: str, cameras: int) -> dict[str, Any]:
+    """Return a result from two, four and eight cameras in which H-NeRF failed with one number of them."""
+    result = synthetic_result(check)
+    eight = {"fast": of_method(30.5, 0.08, 0.9, 8, 0.1), "nerf": of_method(26.2, 0.49, 0.05, 8, 0.1)}
+    result["variants"]["8 cameras"] = {"methods": eight}
+    result["variants"][f"{cameras} cameras"]["methods"]["fast"] = {"error": "no surface"}
+    return result
+
+
+def test_a_failure_of_the_first_method_supports_no_claim() -> None:
+    """From eight cameras to four both have scores: 0.5 and 0.2 dB are lost, Chamfer 0.02 and 0.01."""
+    assert verdict(without_fast("ahead", 2)).startswith("no: 4 cameras: fast 30.0 dB, nerf 26.0 dB; ")
+    assert "; 2 cameras: fast nothing, nerf 20.0 dB; " in verdict(without_fast("ahead", 2))
+    assert verdict(without_fast("loses_least", 2)) == (
+        "no: 2 cameras: fast nothing, nerf 20.0 dB; fast loses 0.5 dB, nerf 0.2 dB; "
+        "2 cameras: fast nothing, nerf Chamfer 0.900; fast loses Chamfer 0.020, nerf Chamfer 0.010."
+    )
+
+
+def test_losses_are_compared_over_the_same_numbers_of_cameras() -> None:
+    """Without `nerf` from two cameras, `fast` loses 0.5 dB from eight to four, not 2.5 to two."""
+    result = without_fast("loses_least", 4)
+    methods = result["variants"]["2 cameras"]["methods"]
+    result["variants"]["4 cameras"]["methods"]["fast"] = of_method(30.0, 0.1, 0.9, 4, 0.1)
+    methods["nerf"] = {"error": "no surface"}
+    assert verdict(result).startswith("no: fast loses 0.5 dB, nerf 0.2 dB; ")
+
+
 def test_quality_falls_with_the_angle_and_who_is_ahead_at_each() -> None:
     """Use six bins of 15 degrees, of which the first and the last hold one image each."""
     found = verdict(synthetic_result("falls_with_angle"))
