@@ -67,21 +67,26 @@ def measure_parts(capture: Path, scratch: Path) -> dict[str, dict[int, dict[str,
     frames, cameras = recorded.train_frames, recorded.train_cameras
     pixels = recorded.cameras[cameras[0]].width_px * recorded.cameras[cameras[0]].height_px
     costs: dict[str, dict[int, dict[str, Cost]]] = {"frames": {}, "cameras": {}, "pixels": {}}
+    for amount in parts_of(len(frames)):
+        part = subset_capture(store, recording, None, tuple(evenly_spaced(frames, amount)), ())
+        costs["frames"][amount] = measure(Store(scratch / f"frames-{amount}"), part)
+    for amount in parts_of(len(cameras)):
+        part = subset_capture(store, recording, tuple(evenly_spaced(cameras, amount)), None, ())
+        costs["cameras"][amount] = measure(Store(scratch / f"cameras-{amount}"), part)
     for share in SHARES:
-        fewer_frames = tuple(evenly_spaced(frames, round(share * len(frames))))
-        fewer_cameras = tuple(evenly_spaced(cameras, round(share * len(cameras))))
         smaller = degrade_capture(store, recording, Degradation(kind="small_images", strength=share**0.5, seed=0))
-        parts = {
-            ("frames", len(fewer_frames)): subset_capture(store, recording, None, fewer_frames, ()),
-            ("cameras", len(fewer_cameras)): subset_capture(store, recording, fewer_cameras, None, ()),
-            ("pixels", round(share * pixels)): subset_capture(store, smaller, None, None, ()),
-        }
-        for (axis, amount), part in parts.items():
-            costs[axis][amount] = measure(Store(scratch / f"{axis}-{amount}"), part)
+        part = subset_capture(store, smaller, None, None, ())
+        costs["pixels"][round(share * pixels)] = measure(Store(scratch / f"pixels-{share:g}"), part)
     whole = measure(Store(scratch / "whole"), subset_capture(store, recording, None, None, ()))
     for axis, amount in {"frames": len(frames), "cameras": len(cameras), "pixels": pixels}.items():
         costs[axis][amount] = whole
     return costs
+
+
+def parts_of(whole: int) -> list[int]:
+    """Return a quarter and a half of a number of frames or cameras, rounded, in ascending order, without those that
+    are none."""
+    return sorted({amount for share in SHARES if (amount := round(share * whole))})
 
 
 def measure(store: Store, recording: Artifact) -> dict[str, Cost]:

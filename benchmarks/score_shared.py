@@ -63,7 +63,8 @@ def lacking(capture: Path, folders: list[str], store: Path) -> Path:
     if absent:
         raise SystemExit(f"{capture / absent[0]}: no such folder to leave out")
     copy = store / "captures" / capture.name
-    return Path(shutil.copytree(capture, copy, ignore=shutil.ignore_patterns(*folders), dirs_exist_ok=True))
+    shutil.rmtree(copy, ignore_errors=True)  # which may have what is to be left out now
+    return Path(shutil.copytree(capture, copy, ignore=lambda folder, _: folders if Path(folder) == capture else []))
 
 
 def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> dict[str, Any]:
