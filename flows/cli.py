@@ -28,8 +28,8 @@ SIZES_PX = (2, 8000)  # of a picture's side, of the same module
 STATURE_M = (0.5, 2.3)  # of hnerf.calibration.diagnosis, which imports numpy
 MAX_COUNT, MAX_M = 999_999, 1000  # pictures have names of six digits
 FOLDERS = {
-    "capture": "the capture's folder, or one video",
-    "folder": "the folder of a capture",
+    "capture": "the capture folder, or one video",
+    "folder": "the capture folder",
     "subject": "<store>/subjects/<name> of a finished `hnerf run`",
 }  # among a command's options, and what they are
 
@@ -129,14 +129,14 @@ def _name(command: Command) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="hnerf", description="From video of a person to an avatar.")
+    parser = argparse.ArgumentParser(prog="hnerf", description="From video of a person to an animatable avatar.")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
 
     store, preset = (argparse.ArgumentParser(add_help=False) for _ in range(2))
-    store.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    store.add_argument("--store", type=Path, default=Path("store"), help="folder of results (default: store)")
     capture = argparse.ArgumentParser(add_help=False, parents=[store])
-    capture.add_argument("capture", type=Path, help="the recording's folder, or one video")
-    preset.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
+    capture.add_argument("capture", type=Path, help="capture folder, or one video")
+    preset.add_argument("--preset", default="fast", help="preset of configs/, or a YAML file (default: fast)")
 
     def add(command: Command, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
         """Add a command that has its function's name, and its docstring as help."""
@@ -146,16 +146,16 @@ def _parser() -> argparse.ArgumentParser:
         return added
 
     run = add(commands.run, store, preset)
-    run.add_argument("capture", type=place, help="the recording's folder or URL, or one video")
-    _add_overrides(run, "override a setting of `hnerf settings`")
+    run.add_argument("capture", type=place, help="capture folder, its URL in a bucket, or one video")
+    _add_overrides(run, "override a setting; `hnerf settings` lists all")
     add(commands.check_cameras, capture, preset)
     add(commands.settings, preset)
 
     _add_calibrate(add(commands.calibrate))
-    add(commands.synchronise).add_argument("folder", type=Path, help="a recording whose cameras started apart")
+    add(commands.synchronise).add_argument("folder", type=Path, help="capture whose cameras did not start together")
     cameras = add(commands.export_cameras)
-    cameras.add_argument("folder", type=Path, help="a recording, or a folder that `calibrate` wrote")
-    cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True)
+    cameras.add_argument("folder", type=Path, help="capture folder, or what `hnerf calibrate` wrote")
+    cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True, help="format to write")
     _add_out(cameras, "cameras")
 
     _add_benchmark(add(commands.benchmark, capture))
@@ -163,11 +163,11 @@ def _parser() -> argparse.ArgumentParser:
     _add_stability(add(commands.stability, capture))
     _add_render(add(commands.render))
     _add_export(add(commands.export, preset))
-    what = "Look into the store, and keep it in order."
+    what = "List, check, clean up and transfer what the store holds."
     add_store_commands(subparsers.add_parser("store", help=what, description=what))
     synth = add(commands.synth)
-    synth.add_argument("out", type=Path, help="the folder to write")
-    _add_overrides(synth, "such as train_cameras=32; `hnerf settings` lists them last")
+    synth.add_argument("out", type=Path, help="new folder to write")
+    _add_overrides(synth, "override a setting, like train_cameras=32; `hnerf settings` lists all at its end")
     add(commands.models)
     add(commands.demo)
     return parser
@@ -178,64 +178,80 @@ def _add_overrides(command: argparse.ArgumentParser, what: str) -> None:
 
 
 def _add_calibrate(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, help="a recording, or a folder with calibration/extrinsic/")
+    command.add_argument("folder", type=Path, help="capture folder, or a folder with calibration/extrinsic/")
     command.add_argument(
         "--from", dest="source", choices=("boards", "person"), default="boards",
-        help="what to calibrate from: footage of a board (default), or the person in the recording",
+        help="calibrate from footage of a board (default), or from the person in the capture",
     )  # fmt: skip
     _add_out(command, "cameras")
-    command.add_argument("--format", choices=CAMERA_FORMATS, action="append", default=[], help="write these files, too")
+    command.add_argument(
+        "--format", choices=CAMERA_FORMATS, action="append", default=[], help="also write this format; may be repeated"
+    )
     boards = command.add_argument_group("from boards")
     boards.add_argument(
-        "--ground-frame", **_number(int, 0, MAX_COUNT, "N", "the frame whose board lies on the floor, at the origin")
+        "--ground-frame",
+        **_number(int, 0, MAX_COUNT, "N", "frame in which the board lies on the floor: the world's origin"),
     )
     person = command.add_argument_group("from the person")
-    person.add_argument("--height", **_number(float, *STATURE_M, "M", "height of the person (default: the mean)"))
-    person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML of cameras")
     person.add_argument(
-        "--fov", **_number(float, 1, 170, "DEG", "field of view across the longer side (default: metadata, or found)")
+        "--height", **_number(float, *STATURE_M, "M", "the person's height (default: the mean of adults)")
+    )
+    person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML file")
+    person.add_argument(
+        "--fov",
+        **_number(
+            float, 1, 170, "DEG", "field of view across the longer side (default: from metadata, else estimated)"
+        ),
     )
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
-    export.add_argument("subject", type=Path, help="<store>/subjects/<name>, as `run` left it")
+    export.add_argument("subject", type=Path, help="<store>/subjects/<name> of a finished `hnerf run`")
     export.add_argument(
         "--motion", type=Path, action="append", default=[], metavar="FILE",
         help=f"add this motion: {MOTIONS}",
     )  # fmt: skip
-    export.add_argument("--allow-poor", action="store_true", help="accept an asset far below its field, too")
+    export.add_argument(
+        "--allow-poor", action="store_true", help="accept an asset that is more than 4 dB below its field"
+    )
     _add_out(export, "asset")
-    _add_overrides(export, "override a setting of the section `asset`")
+    _add_overrides(export, "override a setting under `asset.`")
 
 
 def _add_out(command: argparse.ArgumentParser, default: str) -> None:
-    command.add_argument("--out", type=Path, default=Path(default), help=f"the folder to write (default: {default})")
+    command.add_argument("--out", type=Path, default=Path(default), help=f"new folder to write (default: {default})")
 
 
 def _add_study(command: argparse.ArgumentParser, default: str, folder: str) -> None:
     study = command.add_mutually_exclusive_group()
-    what = f"a name under configs/{folder}/ or a YAML file (default: {default})"
+    what = f"study of configs/{folder}/, or a YAML file (default: {default})"
     study.add_argument("--study", default=default, help=what)
-    study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
+    study.add_argument(
+        "--quick", dest="study", action="store_const", const="quick", help="the study `quick`, about 15 minutes"
+    )
 
 
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     _add_study(benchmark, "dynamic", "benchmark")
-    what = "methods to compare, of the study or any presets, like fast,nerf (default: the study's)"
+    what = "presets or YAML files to compare, like fast,nerf (default: the study's)"
     benchmark.add_argument("--methods", type=_names, metavar="LIST", help=what)
     benchmark.add_argument(
-        "--seconds", **_number(float, 0.1, 1_000_000, "S", "limit of every training (default: the study's)")
+        "--seconds", **_number(float, 0.1, 1_000_000, "S", "time limit of each training (default: the study's)")
     )
 
 
 def _add_ablate(ablations: argparse.ArgumentParser) -> None:
     _add_overrides(ablations, "override a setting in all rows")
-    ablations.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these of configs/ablations/")
+    ablations.add_argument(
+        "--only", nargs="+", default=[], metavar="NAME", help="only these rows, named as in configs/ablations/"
+    )
 
 
 def _add_stability(stability: argparse.ArgumentParser) -> None:
     _add_study(stability, "full", "stability")
-    stability.add_argument("--methods", type=_names, default=[], metavar="LIST", help="presets (default: the study's)")
+    stability.add_argument(
+        "--methods", type=_names, default=[], metavar="LIST", help="presets, like fast,nerf (default: the study's)"
+    )
     stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
 
 
@@ -259,27 +275,50 @@ def _number(kind: type[float], low: float, high: float, unit: str, what: str) ->
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
-    render.add_argument("subject", type=Path, help="<store>/subjects/<name>, as `run` left it")
+    render.add_argument("subject", type=Path, help="<store>/subjects/<name> of a finished `hnerf run`")
     _add_out(render, "pictures")
-    render.add_argument("--what", default="colour", metavar="LIST", help=f"of {','.join(PICTURES)} (default: colour)")
+    render.add_argument(
+        "--what", default="colour", metavar="LIST", help=f"one or more of {','.join(PICTURES)} (default: colour)"
+    )
     view = render.add_mutually_exclusive_group()
-    view.add_argument("--camera", help="a recorded camera's name (default: an orbit)")
-    view.add_argument("--path", type=Path, help="a JSON list of cameras, or a folder of them, to fly along")
-    render.add_argument("--radius", **_number(float, 0.1, MAX_M, "M", "radius of the orbit (default: the cameras')"))
+    view.add_argument("--camera", help="look through this recorded camera (default: an orbit)")
+    view.add_argument("--path", type=Path, help="fly along these cameras: a JSON list, or a folder")
     render.add_argument(
-        "--height", **_number(float, -MAX_M, MAX_M, "M", "height of the orbit above the person's middle")
+        "--radius", **_number(float, 0.1, MAX_M, "M", "radius of the orbit (default: that of the recorded cameras)")
     )
-    render.add_argument("--motion", type=Path, metavar="FILE", help=f"show {MOTIONS} (default: the recording's)")
-    render.add_argument("--frames", default=":", metavar="A:B:STEP", help="poses to show, or one number (default: all)")
     render.add_argument(
-        "--between", nargs=2, **_number(int, 0, MAX_COUNT, "FRAME", "interpolate between two frames' poses")
+        "--height",
+        **_number(
+            float,
+            -MAX_M,
+            MAX_M,
+            "M",
+            "height of the orbit above the person's middle (default: that of the recorded cameras)",
+        ),
     )
-    render.add_argument("--shape", action="append", default=[], metavar="NAME=+X", help="add to a shape value")
     render.add_argument(
-        "--volume", **_number(float, -100, 1000, "PERCENT", "change of the body's volume, like -40 or 80")
+        "--motion", type=Path, metavar="FILE", help=f"show this motion: {MOTIONS} (default: the captured one)"
     )
-    render.add_argument("--size", **_number(int, *SIZES_PX, "PX", "longest side of a picture (default: as recorded)"))
-    render.add_argument("--pictures", **_number(int, 1, MAX_COUNT, "N", "number of pictures (default: one a pose)"))
+    render.add_argument(
+        "--frames", default=":", metavar="FIRST:END:STEP", help="frames to show, or one number (default: all)"
+    )
+    render.add_argument(
+        "--between", nargs=2, **_number(int, 0, MAX_COUNT, "FRAME", "interpolate between the poses of two frames")
+    )
+    render.add_argument(
+        "--shape",
+        action="append",
+        default=[],
+        metavar="NAME=+X",
+        help="add X to a shape value of the body; may be repeated",
+    )
+    render.add_argument(
+        "--volume", **_number(float, -100, 1000, "PERCENT", "change the body's volume by this, like -40 or 80")
+    )
+    render.add_argument(
+        "--size", **_number(int, *SIZES_PX, "PX", "longest side of an image (default: that of the capture)")
+    )
+    render.add_argument("--pictures", **_number(int, 1, MAX_COUNT, "N", "number of images (default: one per pose)"))
 
 
 if __name__ == "__main__":

@@ -25,20 +25,20 @@ def run(options: argparse.Namespace) -> None:
 
 
 def settings(options: argparse.Namespace) -> None:
-    """List the settings that --set takes, as the preset has them, with their types and what they mean."""
+    """List every setting that --set takes: its value in the preset, its type, and what it means."""
     print("\n".join(["hnerf run --set", *settings_list(load_settings(options.preset))]))
     print("\n".join(["\nhnerf synth --set", *settings_list(SyntheticSettings())]))
 
 
 def models(options: argparse.Namespace) -> None:
-    """Fetch the networks for people, hands and LPIPS, and three.js for the viewer; needed once."""
+    """Download the networks for people, hands and LPIPS, and three.js for the viewer; needed once."""
     from hnerf.models import fetch_models
 
     print(f"networks: {fetch_models()}")
 
 
 def demo(options: argparse.Namespace) -> None:
-    """Run `synth` and `run` in ./demo, in minutes."""
+    """Synthesise a capture and train on it, in ./demo; takes minutes."""
     capture = DEMO / "performer"
     if not capture.exists():
         _write_capture(capture, SyntheticSettings())
@@ -67,7 +67,7 @@ def _write_capture(out: Path, settings: SyntheticSettings) -> None:
 
 
 def check_cameras(options: argparse.Namespace) -> None:
-    """Read a recording and check its cameras, nothing more."""
+    """Check the calibration of a capture, and print a verdict for each camera."""
     from flows.train_subject import with_detections
     from tasks.calibration import calibrate
     from tasks.capture import ingest
@@ -99,7 +99,7 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
 
 
 def calibrate(options: argparse.Namespace) -> None:
-    """Find the cameras from footage of a calibration board, or from the person."""
+    """Calibrate cameras from footage of a board, or from the person."""
     if options.source == "person":
         _calibrate_from_person(options)
         return
@@ -130,7 +130,7 @@ def _calibrate_from_person(options: argparse.Namespace) -> None:
 
 
 def synchronise(options: argparse.Namespace) -> None:
-    """Find when each camera started and how its clock runs; write clocks.toml."""
+    """Find the start offset and the clock drift of each camera; write clocks.toml."""
     from hnerf.capture.clocks import FILE, write_clocks
 
     path = options.folder / FILE
@@ -150,7 +150,7 @@ def synchronise(options: argparse.Namespace) -> None:
 
 
 def export_cameras(options: argparse.Namespace) -> None:
-    """Write a recording's cameras as other tools read them."""
+    """Write the cameras of a capture in the format of another tool."""
     if options.folder.resolve() in options.out.resolve().parents:
         raise InputError(f"{options.out}: lies in the recording, whose results would be computed again; give another")
     with atomic_folder(options.out) as partial:
@@ -172,14 +172,14 @@ def benchmark(options: argparse.Namespace) -> None:
 
 
 def ablate(options: argparse.Namespace) -> None:
-    """Train without each part of the method in turn, and write a table."""
+    """Train without each part of the method in turn; write a table of the scores."""
     from flows.ablations import ablate as flow
 
     _show(flow.fn(options.capture, options.preset, options.store, options.overrides, options.only))
 
 
 def stability(options: argparse.Namespace) -> None:
-    """Make a capture worse in many ways, and report what breaks."""
+    """Degrade a capture in many ways, and report what breaks."""
     from flows.stability import stability as flow
 
     _show(flow.fn(options.capture, options.study, options.store, options.methods, options.only))
@@ -190,7 +190,7 @@ def _show(table: Path) -> None:
 
 
 def render(options: argparse.Namespace) -> None:
-    """Write pictures and videos of a trained person."""
+    """Render images and video of a trained person."""
     from hnerf.render.subject import RenderOptions, render_subject
     from tasks.store import require_intact
 
@@ -215,7 +215,7 @@ def render(options: argparse.Namespace) -> None:
 
 
 def export(options: argparse.Namespace) -> None:
-    """Write the asset of a trained person again, with other settings or further motions."""
+    """Export the asset of a trained person again, with other settings or more motions."""
     from hnerf.asset.subject import export_subject
     from tasks.store import recording_digest, require_intact
 

@@ -17,7 +17,7 @@ UNITS_S = {"d": 86400, "h": 3600, "m": 60, "s": 1}
 
 
 def list_(options: argparse.Namespace) -> None:
-    """List the subjects: size, when their results were made, and of which recording."""
+    """List the subjects: size, first and latest result, and recording."""
     from tasks.garbage import find_garbage
     from tasks.inventory import NOBODY, Inventory, recording_of
 
@@ -42,7 +42,7 @@ def list_(options: argparse.Namespace) -> None:
 
 
 def show(options: argparse.Namespace) -> None:
-    """Show a subject's latest artifacts, and the others that it has."""
+    """List the artifacts of a subject, and mark the latest."""
     from tasks.inventory import Inventory, recording_of
 
     inventory = Inventory.of(_store(options))
@@ -59,7 +59,7 @@ def show(options: argparse.Namespace) -> None:
 
 
 def verify(options: argparse.Namespace) -> None:
-    """Check every file of the store, or of some subjects, against its digest."""
+    """Check every file against its recorded digest."""
     from tasks.verify import faults
 
     found = faults(_store(options), options.names)
@@ -71,7 +71,7 @@ def verify(options: argparse.Namespace) -> None:
 
 
 def gc(options: argparse.Namespace) -> None:
-    """List what no subject's latest results need, and what interrupted work left; remove it with --yes."""
+    """List what no subject needs and what interrupted work left behind; with --yes, remove it."""
     from tasks.garbage import collect, find_garbage
     from tasks.inventory import Inventory
 
@@ -93,7 +93,7 @@ def gc(options: argparse.Namespace) -> None:
 
 
 def export(options: argparse.Namespace) -> None:
-    """Write a subject's latest results, and all they were computed from, into one file."""
+    """Pack the latest results of a subject, and all that they were computed from, into an archive."""
     from tasks.archive import export_subject
 
     out = options.out or Path(f"{options.name}.tar")
@@ -102,7 +102,7 @@ def export(options: argparse.Namespace) -> None:
 
 
 def import_(options: argparse.Namespace) -> None:
-    """Put an archive that `export` wrote into a store; take it only from people whose results you trust."""
+    """Unpack an archive of `hnerf store export` into a store; import only from people whom you trust."""
     from tasks.archive import import_subject
     from tasks.store import Store
 
@@ -120,19 +120,31 @@ def add_store_commands(store: argparse.ArgumentParser) -> None:
         added[name] = actions.add_parser(name, help=what, description=what)
         added[name].set_defaults(command=action)
     for name in ("show", "export"):
-        added[name].add_argument("name", help="the subject's, as `hnerf store list` shows it")
-    added["verify"].add_argument("names", nargs="*", metavar="NAME", help="subjects (default: the whole store)")
-    added["gc"].add_argument("--yes", action="store_true", help="remove; otherwise nothing is changed")
-    added["gc"].add_argument(
-        "--keep", type=_at_least_one, default=1, metavar="N", help="newest results of each subject (default: 1)"
+        added[name].add_argument("name", help="subject, as `hnerf store list` shows it")
+    added["verify"].add_argument(
+        "names", nargs="*", metavar="NAME", help="check these subjects alone (default: the whole store)"
     )
     added["gc"].add_argument(
-        "--older", type=duration_s, default="1d", metavar="TIME", help="not used for so long: 30d, 12h (default: 1d)"
+        "--yes", action="store_true", help="remove what is listed; without this, nothing is changed"
     )
-    added["export"].add_argument("--out", type=Path, help="the file to write (default: NAME.tar)")
-    added["import"].add_argument("archive", type=Path, help="a file that `export` wrote")
+    added["gc"].add_argument(
+        "--keep",
+        type=_at_least_one,
+        default=1,
+        metavar="N",
+        help="keep the results of the N newest runs of each subject (default: 1)",
+    )
+    added["gc"].add_argument(
+        "--older",
+        type=duration_s,
+        default="1d",
+        metavar="TIME",
+        help="only what has not been used for so long: 30d, 12h, 0 (default: 1d)",
+    )
+    added["export"].add_argument("--out", type=Path, help="new file to write (default: NAME.tar)")
+    added["import"].add_argument("archive", type=Path, help="archive of `hnerf store export`")
     for parser in added.values():
-        parser.add_argument("--store", type=Path, default=Path("store"), help="where results are (default: store)")
+        parser.add_argument("--store", type=Path, default=Path("store"), help="folder of results (default: store)")
 
 
 def duration_s(text: str) -> float:
@@ -154,7 +166,7 @@ def _store(options: argparse.Namespace) -> "Store":
 
     store = Store(options.store.resolve())
     if not store.exists():
-        raise InputError(f"{options.store}: is no store; give --store the place of the results")
+        raise InputError(f"{options.store}: not a store; give its folder with --store")
     return store
 
 

@@ -67,7 +67,7 @@ def test_a_folder_that_is_no_store_is_refused(
     thumbnail = tmp_path / "pictures" / "thumbnails" / ("a" * 32)  # is named like an artifact
     thumbnail.mkdir(parents=True)
     assert main(["store", *command.split(), "--store", "pictures"]) == 2
-    assert capsys.readouterr().err == "hnerf: pictures: is no store; give --store the place of the results\n"
+    assert capsys.readouterr().err == "hnerf: pictures: not a store; give its folder with --store\n"
     assert thumbnail.is_dir() and not (tmp_path / "ada.tar").exists()
 
 
