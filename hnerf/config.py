@@ -39,20 +39,20 @@ class Section(BaseModel):
 class CaptureSettings(Section):
     """Settings of ingestion."""
 
-    max_side_px: int = Field(default=1024, ge=16)  # images with a longer side are shrunk when they are ingested
-    max_frames: int = Field(default=60, ge=1)  # training frames, evenly strided, unless capture.toml chooses
+    max_side_px: int = Field(default=1024, ge=16)  # larger images are shrunk to this longest side at ingestion
+    max_frames: int = Field(default=60, ge=1)  # most training frames, evenly spaced, where capture.toml lists none
 
 
 class SyntheticSettings(Section):
     """Settings of the synthetic capture that `hnerf synth` writes; no stage of a run reads them."""
 
     seed: Seed = 0
-    size_px: int = Field(default=256, ge=16, le=4096)
+    size_px: int = Field(default=256, ge=16, le=4096)  # side of the square images
     train_cameras: int = Field(default=4, ge=1)  # on a ring, at equal angles
-    test_cameras: int = Field(default=2, ge=0)  # each half-way between two of those, evenly spaced
+    test_cameras: int = Field(default=2, ge=0)  # each half-way between two training cameras
     train_frames: int = Field(default=20, ge=1)
-    novel_pose_frames: int = Field(default=6, ge=0)
-    fps: float = Field(default=10.0, ge=0.01, le=10_000)  # as capture.toml may state
+    novel_pose_frames: int = Field(default=6, ge=0)  # frames with new poses, not trained on
+    fps: float = Field(default=10.0, ge=0.01, le=10_000)  # frame rate
 
     @model_validator(mode="after")
     def _one_test_camera_in_a_gap(self) -> Self:
@@ -62,16 +62,18 @@ class SyntheticSettings(Section):
 
 
 class DetectionSettings(Section):
-    source: Literal["recording", "network", "both"] | None = None  # None: see docs/formats.md, Keypoints
+    source: Literal["recording", "network", "both"] | None = None  # null: see docs/formats.md, From a network
     size: Literal["heavy", "full", "lite"] = "heavy"  # of the landmark network
-    hands: Literal["auto", "none"] = "auto"  # auto: find the subject's where networks are installed; 0.04 s an image
+    hands: Literal["auto", "none"] = "auto"  # auto: find the hands if the networks are installed; 0.04 s an image
 
 
 class CalibrationSettings(Section):
     """Settings of the calibration check and of the refinement of cameras."""
 
-    max_residual_px: float = Field(default=5.0, gt=0)  # a camera's median at most; more for a person taller than 357 px
-    min_improvement: float = Field(default=0.02, ge=0, lt=1)  # share by which held-out residuals must fall to accept it
+    max_residual_px: float = Field(
+        default=5.0, gt=0
+    )  # limit of a camera's median; scales up if the person exceeds 357 px
+    min_improvement: float = Field(default=0.02, ge=0, lt=1)  # a correction must lower held-out residuals by this share
 
 
 class SegmentationSettings(Section):
@@ -79,11 +81,11 @@ class SegmentationSettings(Section):
 
     excluded_from_key: ClassVar[tuple[str, ...]] = ("rounds", "still_px")  # of the flow, which repeats the stage
     shadow_chroma: float = Field(default=0.01, gt=0)  # std of log colour ratios in a shadow, beyond noise
-    darkest_shadow: float = Field(default=0.3, gt=0, lt=1)  # share of the brightness that is left in the deepest shadow
-    reach: float = Field(default=0.13, gt=0)  # of clothes and hair from limbs, in heights of the person
-    model: Path | None = None  # ONNX file of a segmentation network, used in place of plates; given masks come first
-    rounds: int = Field(default=3, ge=1)  # at most, of fit and segmentation, where neither masks nor plates are given
-    still_px: float = Field(default=0.5, gt=0)  # rounds end when the masks' edges move less than this on average
+    darkest_shadow: float = Field(default=0.3, gt=0, lt=1)  # brightness left in the deepest shadow, as a share
+    reach: float = Field(default=0.13, gt=0)  # of clothes and hair beyond the limbs, in body heights
+    model: Path | None = None  # ONNX segmentation network; comes before clean plates, after given masks
+    rounds: int = Field(default=3, ge=1)  # most rounds of fit and segmentation, without masks and plates
+    still_px: float = Field(default=0.5, gt=0)  # rounds end when mask edges move less than this on average
 
 
 class FitSettings(Section):
@@ -93,20 +95,22 @@ class FitSettings(Section):
     their own, 1.
     """
 
-    body_model: Literal["anny"] | Path = "anny"  # or an SMPL, SMPL-H or SMPL-X file (.npz, .pkl) of one's own
-    keypoint_m: float = Field(default=0.02, gt=0)  # of a keypoint seen with full confidence
-    keypoint_outlier_m: float = Field(default=0.15, gt=0)  # beyond it a keypoint counts as an outlier
-    offset_m: float = Field(default=0.02, gt=0)  # between where the detector and the body model place a keypoint
+    body_model: Literal["anny"] | Path = "anny"  # or the path of an SMPL, SMPL-H or SMPL-X file (.npz, .pkl)
+    keypoint_m: float = Field(default=0.02, gt=0)  # std of a keypoint seen with full confidence
+    keypoint_outlier_m: float = Field(default=0.15, gt=0)  # a keypoint farther off counts as an outlier
+    offset_m: float = Field(default=0.02, gt=0)  # std between the detector's and the body model's place of a keypoint
     stature_m: float = Field(default=1.72, gt=0)  # mean height of people
-    stature_std_m: float = Field(default=0.08, gt=0)
-    phenotype_std: float = Field(default=0.25, gt=0)
-    local_change_std: float = Field(default=0.3, gt=0)
-    acceleration_mps2: float = Field(default=10.0, gt=0)  # of the trunk; hands and feet three to four times as much
-    inside_m: float = Field(default=0.008, gt=0)  # of residuals where the mask's edge lies inside the body
-    outside_m: float = Field(default=0.02, gt=0)  # of residuals where it lies outside the body
-    clothing_m: float = Field(default=0.08, gt=0)  # beyond it cloth and hair no longer pull the body outwards
+    stature_std_m: float = Field(default=0.08, gt=0)  # std of the height of people
+    phenotype_std: float = Field(default=0.25, gt=0)  # std of anny's phenotype values
+    local_change_std: float = Field(default=0.3, gt=0)  # std of anny's local shape changes
+    acceleration_mps2: float = Field(
+        default=10.0, gt=0
+    )  # std, of the trunk; knees and elbows 2, hands and feet 3 to 4 times
+    inside_m: float = Field(default=0.008, gt=0)  # std of residuals where the mask's edge lies inside the body
+    outside_m: float = Field(default=0.02, gt=0)  # std of residuals where the mask's edge lies outside the body
+    clothing_m: float = Field(default=0.08, gt=0)  # cloth and hair farther out do not pull the body outwards
     spacing_m: float = Field(default=0.03, gt=0)  # between neighbouring points of an outline
-    contour_steps: int = Field(default=10, ge=1)
+    contour_steps: int = Field(default=10, ge=1)  # steps of the fit to outlines
 
 
 class FieldSettings(Section):
@@ -121,7 +125,7 @@ class FieldSettings(Section):
     models_motion: ClassVar[bool] = True
     no_new_poses: ClassVar[str] = ""
     kind: str
-    scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge: the unit of sigma_h, gamma and of the root's T
+    scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge; unit of sigma_h, gamma and the root's T
 
 
 class FastFieldSettings(FieldSettings):
@@ -130,19 +134,19 @@ class FastFieldSettings(FieldSettings):
 
     tunes_poses: ClassVar[bool] = True
     kind: Literal["fast"] = "fast"
-    outer_m: float = Field(default=0.0, ge=0)  # thickness of the shell outside the body
-    inner_m: float = Field(default=0.0, ge=0)  # thickness of the shell inside the body
-    shell_cell_m: float = Field(default=0.015, gt=0)
-    samples: int = Field(default=0, ge=0)
-    geometry_cells: tuple[PositiveInt, ...] = ()  # of each level, on the box's longest side
-    colour_cells: tuple[PositiveInt, ...] = ()
-    channels: int = Field(default=4, ge=1)
-    width: int = Field(default=64, ge=1)
-    pose_width: int = Field(default=0, ge=0)
-    nodes: int = Field(default=0, ge=0)  # of each frame's deformation graph
+    outer_m: float = Field(default=0.0, ge=0)  # thickness of the shell outside the body; 0: chosen from the scene
+    inner_m: float = Field(default=0.0, ge=0)  # thickness of the shell inside the body; 0: chosen from the scene
+    shell_cell_m: float = Field(default=0.015, gt=0)  # cell size of the shell's voxel grid
+    samples: int = Field(default=0, ge=0)  # per ray; 0: chosen from the scene
+    geometry_cells: tuple[PositiveInt, ...] = ()  # per grid level, along the longest side; empty: chosen
+    colour_cells: tuple[PositiveInt, ...] = ()  # the same for colour
+    channels: int = Field(default=4, ge=1)  # features per grid node and level
+    width: int = Field(default=64, ge=1)  # of the networks' layers
+    pose_width: int = Field(default=0, ge=0)  # of the pose code; 0: chosen from the scene
+    nodes: int = Field(default=0, ge=0)  # of each frame's deformation graph; 0: chosen from the scene
     grid_learning_rate: float = Field(default=5e-2, gt=0)
     network_learning_rate: float = Field(default=1e-2, gt=0)
-    deformation_learning_rate: float = Field(default=1e-3, ge=0)  # metres; 0: frames do not deform the body
+    deformation_learning_rate: float = Field(default=1e-3, ge=0)  # in metres; 0: frames do not deform the body
 
 
 class PaperFieldSettings(FieldSettings):
@@ -150,14 +154,14 @@ class PaperFieldSettings(FieldSettings):
 
     tunes_poses: ClassVar[bool] = True
     kind: Literal["paper"] = "paper"
-    samples: int = Field(default=256, ge=2)  # coarse, and as many fine
-    box_samples: int = Field(default=0, ge=0)  # of the coarse samples, those placed only inside the person's box
-    rays: Literal["image", "box"] = "image"  # train on all pixels, or on those whose rays meet the person's box
-    gamma: float = Field(default=200.0, gt=0)
+    samples: int = Field(default=256, ge=2)  # coarse samples per ray, and as many fine ones
+    box_samples: int = Field(default=0, ge=0)  # coarse samples placed only in the person's box
+    rays: Literal["image", "box"] = "image"  # train on all pixels, or on those that look into the person's box
+    gamma: float = Field(default=200.0, gt=0)  # sharpness of the surface, per scene unit
     learning_rate: float = Field(default=1e-3, gt=0)
-    root_condition: bool = True  # colour depends on T
-    view_octaves: int = Field(default=0, ge=0)  # of the encoding of v
-    bf16: bool = False  # all layers of the networks but the last multiply in bfloat16
+    root_condition: bool = True  # whether colour depends on the root transform T
+    view_octaves: int = Field(default=0, ge=0)  # of the encoding of the viewing direction
+    bf16: bool = False  # multiply in bfloat16 in all layers but the last
 
     @model_validator(mode="after")
     def _some_samples_lie_outside_the_box(self) -> Self:
@@ -172,7 +176,7 @@ class NerfSettings(FieldSettings):
     models_motion: ClassVar[bool] = False
     no_new_poses: ClassVar[str] = "NeRF models one moment"
     kind: Literal["nerf"] = "nerf"
-    samples: int = Field(default=24, ge=2)  # coarse, and as many fine
+    samples: int = Field(default=24, ge=2)  # coarse samples per ray, and as many fine ones
     width: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=5e-3, gt=0)
 
@@ -183,7 +187,7 @@ class IdrSettings(FieldSettings):
     models_motion: ClassVar[bool] = False
     no_new_poses: ClassVar[str] = "IDR models one moment"
     kind: Literal["idr"] = "idr"
-    samples: int = Field(default=32, ge=3)  # per ray, to find its least distance
+    samples: int = Field(default=32, ge=3)  # per ray, to find where it is nearest to the surface
     width: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=1e-3, gt=0)
 
@@ -205,11 +209,11 @@ class NerfiesSettings(FieldSettings):
 
     no_new_poses: ClassVar[str] = "Nerfies has no pose to set: it replays the moments it was trained on"
     kind: Literal["nerfies"] = "nerfies"
-    samples: int = Field(default=24, ge=2)  # coarse, and as many fine
-    width: int = Field(default=64, ge=2)  # of the template network
+    samples: int = Field(default=24, ge=2)  # coarse samples per ray, and as many fine ones
+    width: int = Field(default=64, ge=2)  # of the template network's layers
     deformation_width: int = Field(default=64, ge=2)
     code_width: int = Field(default=8, ge=1)  # of each frame's latent code
-    anneal_share: float = Field(default=1 / 3, gt=0, le=1)  # of training, until the deformation uses all octaves
+    anneal_share: float = Field(default=1 / 3, gt=0, le=1)  # share of training until all octaves are used
     learning_rate: float = Field(default=1e-3, gt=0)  # as published; with 5e-3, it comes apart after minutes
 
 
@@ -228,13 +232,13 @@ class LossSettings(Section):
     residual: float = Field(default=5e-4, ge=0)
     fit: float = Field(default=1.0, ge=0)
     increment: float = Field(default=0.02, ge=0)
-    elastic: float = Field(default=0.0, ge=0)  # not in the paper: regularises the deformations of `fast` and Nerfies
-    floor: float = Field(default=0.0, ge=0)  # not in the paper; per metre: keeps the surface above the ground
-    fog: float = Field(default=0.0, ge=0)  # not in the paper: the box is empty beside the person
-    eta: float = Field(default=1.0, ge=0)  # weight of the surroundings in blend; 0.25 where floor or furniture is near
+    elastic: float = Field(default=0.0, ge=0)  # not in the paper: smooths the deformations of `fast` and Nerfies
+    floor: float = Field(default=0.0, ge=0)  # per metre, not in the paper: keeps the surface above the ground
+    fog: float = Field(default=0.0, ge=0)  # not in the paper: empties the box beside the person
+    eta: float = Field(default=1.0, ge=0)  # weight of the surroundings in blend; 0.25 near floor or furniture
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
     geometry_roles: GeometryRoles = "surface_leads"  # whether geometry moves the density alone, or both
-    density_steepness: float = Field(default=0.02, gt=0)  # lambda; docs/findings.md, Published networks, says why
+    density_steepness: float = Field(default=0.02, gt=0)  # lambda; see docs/findings.md, Published networks
 
 
 AnyFieldSettings = (
@@ -249,19 +253,19 @@ class TrainingSettings(Section):
     field: AnyFieldSettings = Field(default=FastFieldSettings(), discriminator="kind")
     losses: LossSettings = LossSettings()
     steps: int = Field(default=0, ge=0)  # 0: chosen from the scene
-    seconds: float | None = Field(default=None, gt=0)  # limit on the time for the field's steps; None: no limit
-    novel_pose_steps: int = Field(default=100, ge=0)  # for the poses of novel frames, against the finished field
+    seconds: float | None = Field(default=None, gt=0)  # time limit for the field's steps; null: none
+    novel_pose_steps: int = Field(default=100, ge=0)  # to tune the poses of novel frames against the finished field
     frames_per_step: int = Field(default=8, ge=1)
-    rays_per_frame: int = Field(default=192, ge=1)  # with frames_per_step frames; fewer share these rays
-    pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0 keeps the fitted poses and shape
-    one_posture: bool | None = None  # in all training frames, so that only the root moves; None: chosen from the scene
-    ground: bool | None = None  # the ground is at height 0; None: chosen from the fitted feet
+    rays_per_frame: int = Field(default=192, ge=1)  # at frames_per_step frames; fewer frames share all rays
+    pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0: keep the fitted poses and shape
+    one_posture: bool | None = None  # one posture in all training frames; null: chosen from the scene
+    ground: bool | None = None  # the ground is at height 0; null: chosen from the fitted feet
     absorb_steps: int = Field(default=100, ge=1)  # between exact updates of the posed bodies
-    noise: float = Field(default=0.1, ge=0)  # std, on theta, T and v
-    checkpoint_steps: int = Field(default=100, ge=1)
-    snapshots_s: tuple[PositiveFloat, ...] = ()  # times at which the subject is also saved, below `snapshots/`
-    processes: int = Field(default=0, ge=0)  # 0: one for each GPU, or one without any
-    memory_gib: float | None = Field(default=None, gt=0)  # per process, for the rays of a step; None: what is free
+    noise: float = Field(default=0.1, ge=0)  # std of the noise added to theta, T and v
+    checkpoint_steps: int = Field(default=100, ge=1)  # between checkpoints
+    snapshots_s: tuple[PositiveFloat, ...] = ()  # times at which to save the subject, below `snapshots/`
+    processes: int = Field(default=0, ge=0)  # 0: one per GPU, or one without a GPU
+    memory_gib: float | None = Field(default=None, gt=0)  # per process, for the rays of a step; null: what is free
     seed: Seed = 0
 
     @model_validator(mode="after")
@@ -282,35 +286,35 @@ class EvaluationSettings(Section):
 
     excluded_from_key: ClassVar[tuple[str, ...]] = ("holdout",)  # of the flow, which names the camera to the stage
     max_meshes: int = Field(default=4, ge=1)  # per split
-    max_images: int | None = Field(default=None, ge=1)  # per split; None: all
-    report_rows: int = Field(default=3, ge=1)  # frames shown of each split
-    holdout: str | None = None  # a camera, or "each" in turn, that a second training leaves out and is scored on
+    max_images: int | None = Field(default=None, ge=1)  # per split; null: all
+    report_rows: int = Field(default=3, ge=1)  # frames shown per split
+    holdout: str | None = None  # a camera, or each in turn: train without it, score on it
 
 
 class AssetSettings(Section):
     """Settings of the exported assets."""
 
-    grid_cells: int = Field(default=256, ge=16)  # of marching cubes, on the longest side
-    topology: Literal["registered", "captured", "both"] = "registered"  # the body's mesh; marching cubes'; in USD, both
-    faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered one has the body model's
-    level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # triangles, at most, of each lower level of detail
-    texture_px: int = Field(default=1024, ge=16)
-    texture_poses: int = Field(default=3, ge=1)  # of the capture, whose median is the field's colour of a texel
-    photograph_frames: int = Field(default=16, ge=0)  # whose training photographs make the texture; 0: the field alone
-    normal_map_px: int = Field(default=0, ge=0)  # side of the normal map; 0: none, since it shows the grids' cells
-    correctives: int = Field(default=16, ge=0, le=64)  # components of what frames have beyond skinning
-    bones: Literal["along", "identity"] = "along"  # joints' axes at rest: Y along the bone, or those of the stage
-    splats: int = Field(default=0, ge=0, le=1_000_000)  # Gaussian splats on the surface, in files of their own; 0: none
-    allow_poor: bool = False  # hand over an asset that is more than 4 dB below its field, too
-    version: str = "1"  # of the asset, as its assetInfo says
-    licence: str = ""  # of the asset, as its assetInfo says
+    grid_cells: int = Field(default=256, ge=16)  # of marching cubes, along the longest side
+    topology: Literal["registered", "captured", "both"] = "registered"  # body model's mesh, marching cubes', both
+    faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered mesh has the body model's
+    level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # most triangles of each lower level of detail
+    texture_px: int = Field(default=1024, ge=16)  # side of the texture
+    texture_poses: int = Field(default=3, ge=1)  # poses whose median gives the field's colour of a texel
+    photograph_frames: int = Field(default=16, ge=0)  # frames whose photographs make the texture; 0: the field alone
+    normal_map_px: int = Field(default=0, ge=0)  # side of the normal map; 0: none, since it shows grid cells
+    correctives: int = Field(default=16, ge=0, le=64)  # blend shapes for what skinning leaves out; 0: none
+    bones: Literal["along", "identity"] = "along"  # joint axes at rest: Y along the bone, or the stage's
+    splats: int = Field(default=0, ge=0, le=1_000_000)  # number of Gaussian splats; 0: no splat files
+    allow_poor: bool = False  # accept an asset that is more than 4 dB below its field
+    version: str = "1"  # version in the asset's assetInfo
+    licence: str = ""  # licence in the asset's assetInfo
 
 
 class LimitSettings(Section):
     """Time limits: how long a stage may make no progress before it is ended. No result depends on them."""
 
-    stage_s: float = Field(default=1800.0, gt=0)  # whatever its size, and
-    image_s: float = Field(default=5.0, ge=0)  # for each image: frames times cameras
+    stage_s: float = Field(default=1800.0, gt=0)  # a stage may make no progress for this long, plus
+    image_s: float = Field(default=5.0, ge=0)  # this for each image: frames times cameras
 
 
 class Settings(Section):
