@@ -58,5 +58,12 @@ def test_every_package_has_an_api_page() -> None:
         assert f"api/{folder.name}.md" in nav
 
 
+def test_the_design_names_every_module_and_package() -> None:
+    text = (ROOT / "docs" / "design.md").read_text()
+    packages = [f"{path.parent.name}/" for path in (ROOT / "hnerf").glob("*/__init__.py")]
+    modules = [path.name for path in (ROOT / "hnerf").glob("*.py") if path.name != "__init__.py"]
+    assert [name for name in packages + modules if f"`{name}`" not in text] == []
+
+
 def test_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 100
