@@ -52,7 +52,7 @@ def ablate(
     Args:
         capture: The recording's folder, or one video; relative to the repository.
         preset: A name under configs/, or a YAML file.
-        store: Where results are kept.
+        store: Folder of results.
         overrides: Settings that differ from the preset in all rows, like training.steps=100.
         only: Names of ablations, all if empty; the table's name then ends in "-part".
     """

@@ -49,7 +49,7 @@ def benchmark(
         study: A name under configs/benchmark/, or a YAML file.
         methods: Of the study, or presets, instead of all; the table's name then ends in "-part".
         seconds: Limit of every training, instead of the study's; likewise.
-        store: Where results are kept.
+        store: Folder of results.
     """
     whole = load_study(study)
     plan = whole.restricted_to(methods or [], seconds)

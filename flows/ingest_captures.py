@@ -41,20 +41,19 @@ def ingest_captures(
 ) -> list[str]:
     """Start `train-subject` once for every capture in the subfolders of a folder; return those started now.
 
-    The folder is made if it does not exist. A capture is known by its content: moved, renamed or copied, it is not
-    trained again, unless its run found the folder missing. In a bucket, names, sizes and ETags stand for content. One
-    that cannot be read is noted in `<folder>/.refused/<name>.txt`, unless it is in a bucket. Runs that crashed are put
-    back into the queue.
+    The folder is created if it does not exist. A capture is identified by its content: moved, renamed or copied, it is
+    not trained again, unless its run found the folder missing. In a bucket, names, sizes and ETags identify it.
+    `<folder>/.refused/<name>.txt` says why a capture cannot be read (not in a bucket). Crashed runs are queued again.
 
     Args:
         folder: The folder to watch, or the URL of one in a bucket. Each subfolder is a capture.
-        preset: Settings of the runs: a name under configs/, or a YAML file.
-        store: Where results are kept.
-        settle_s: Seconds since the last change in a folder, before which it counts as still being written; in a bucket,
-            more than the upload of its largest file takes.
-        max_unfinished: Nothing more is started while this many runs have not ended.
-        max_restarts: How often a run is begun again whose process or machine was lost.
-        min_free_gib: Nothing more is started while the store's disk has less free space than this, in GiB.
+        preset: Settings of the runs: a preset of configs/, or a YAML file.
+        store: Folder of results.
+        settle_s: A folder that changed less than this many seconds ago counts as still being written. For a bucket, set
+            more than the upload of the largest file takes.
+        max_unfinished: Start nothing while this many runs are waiting or running.
+        max_restarts: How often to restart a run whose process or machine was lost.
+        min_free_gib: Start nothing while the store's disk has less free space than this, in GiB.
     """
     ledger = Ledger.of(store)
     folder = place(folder)

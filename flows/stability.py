@@ -66,7 +66,7 @@ def stability(
     Args:
         capture: The recording's folder, or one video; relative to the repository.
         study: A name under configs/stability/, or a YAML file.
-        store: Where results are kept.
+        store: Folder of results.
         methods: Presets in place of the study's; the table's name then ends in "-part".
         only: Names of degradations; likewise.
     """

@@ -66,9 +66,9 @@ def train_subject(
     in turn.
 
     Args:
-        capture: The recording's folder, or one video; relative to the repository, or a folder's URL in a bucket.
-        preset: A name under configs/ (fast, demo, paper, ...), or a YAML file.
-        store: Where results are kept.
+        capture: The capture folder or one video, relative to the checkout; or the URL of a folder in a bucket.
+        preset: A preset of configs/ (fast, demo, paper, ...), or a YAML file.
+        store: Folder of results.
         overrides: Settings that differ from the preset, like training.steps=2000; `hnerf settings` lists all.
     """
     with shown_progress():
