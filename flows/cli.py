@@ -194,7 +194,10 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
     )
     person = command.add_argument_group("from the person")
     person.add_argument(
-        "--height", **_number(float, *STATURE_M, "M", "the person's height (default: the mean of adults)")
+        "--height",
+        **_number(
+            float, *STATURE_M, "M", "the person's height (default: stature_m of capture.toml, else the mean of adults)"
+        ),
     )
     person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML file")
     person.add_argument(

@@ -41,7 +41,7 @@ def degrade_clothing(
     return {}
 
 
-@stage("study-masks", version="1")
+@stage("study-masks", version="2")
 def degrade_masks(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact, degradation: Degradation
 ) -> dict[str, float]:

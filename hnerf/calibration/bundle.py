@@ -3,11 +3,10 @@
 import dataclasses
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hnerf.capture.normalise import UNDISTORTED
+from hnerf.capture.lens import undistort_points
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import reprojection_px, triangulate
@@ -124,10 +123,8 @@ def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], shared: np.ndarr
     for i, camera in enumerate(cameras):
         if not (shared[i] and k1):
             continue
-        seen, K = keypoints[i, :, 2] > 0, camera.K
-        distorted = np.ascontiguousarray(keypoints[i, seen, None, :2])
-        k = np.array([k1, 0, 0, 0])
-        straight[i, seen, :2] = cv2.undistortPoints(distorted, K, k, P=K, criteria=UNDISTORTED)[:, 0]
+        seen = keypoints[i, :, 2] > 0
+        straight[i, seen, :2] = undistort_points(keypoints[i, seen, :2], camera.K, np.array([k1, 0, 0, 0]))
     return straight
 
 

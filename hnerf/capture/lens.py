@@ -14,6 +14,8 @@ from hnerf.geometry.camera import Camera
 MIN_FOCAL_PX = 1.0  # a smaller focal length is an error of units
 MAX_SKEW_PX = 0.1  # of a camera with distortion, which OpenCV undistorts as if there were no skew
 MAX_NUMBER = 1e9  # of a calibration; beyond it, later arithmetic overflows
+# OpenCV's default of 5 iterations is off by pixels.
+UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,12 @@ class Lens:
 def pinhole(camera: Camera) -> Lens:
     """Return a camera of undistorted images as a lens without distortion."""
     return Lens(camera.name, camera.K, np.zeros(5), camera.R, camera.t_m, camera.size_px)
+
+
+def undistort_points(points_px: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Map pixels (..., 2) of a recorded image to those of the pinhole camera with the same K; NaN stays."""
+    flat = np.ascontiguousarray(points_px.reshape(-1, 1, 2))
+    return cv2.undistortPoints(flat, K, distortion, P=K, criteria=UNDISTORTED).reshape(points_px.shape)
 
 
 def known_size(lens: Lens) -> tuple[int, int]:

@@ -8,16 +8,13 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import read_rgb, write_image
-from hnerf.capture.lens import Lens
+from hnerf.capture.lens import Lens, undistort_points
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MAX_ROUNDING = 1.0  # grey levels, by which two decoders differ on average
 MAX_LABELS = 64  # levels of a mask of labels; a mask of more has soft edges
 GRID = 32  # samples along each side of a picture, to see what a distortion does
-
-# OpenCV's default of 5 iterations is off by pixels.
-UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -62,11 +59,11 @@ class Normaliser:
     def keypoints(self, recorded: np.ndarray) -> np.ndarray:
         """Convert recorded keypoints (..., 25, 3) x_px, y_px, confidence to the linear camera; points without
         confidence become zero."""
-        xy = recorded[..., :2].reshape(-1, 1, 2)
+        xy = recorded[..., :2]
         if self.maps is not None:
-            xy = cv2.undistortPoints(xy, self.lens.K, self.lens.distortion, P=self.lens.K, criteria=UNDISTORTED)
+            xy = undistort_points(xy, self.lens.K, self.lens.distortion)
         scale = np.array(self.camera.size_px) / self.recorded_size_px
-        xy = xy.reshape(*recorded.shape[:-1], 2) * scale + (scale - 1) / 2  # pixel centres at integers
+        xy = xy * scale + (scale - 1) / 2  # pixel centres at integers
         return np.concatenate([xy, recorded[..., 2:]], -1) * (recorded[..., 2:] > 0)
 
     def write_image(self, rgb: np.ndarray, source: Path, verbatim: Path | None, target: Path) -> None:

@@ -83,6 +83,9 @@ def test_a_camera_of_unknown_height_is_raised_above_a_person_of_known_stature() 
     np.testing.assert_allclose(raised.centre_m, camera.centre_m, atol=1e-6)
     assert words.startswith(f"its height is not known: {height_m:.2f} m if")
     assert raised_above_ground(camera, standing(), "z", 1.7) == (camera, "")
+    head_first = standing()
+    head_first[:, 0, 1] = head_first[:, [19, 21, 22, 24], 1].max(1) + 100  # would stand below the ground
+    assert raised_above_ground(lowered, head_first, "z", 1.7)[0] is lowered
 
 
 def test_the_rendered_performer_stands_on_the_ground(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -18,7 +18,7 @@ from hnerf.capture.board_footage import BoardFootage, load_board_corners, read_b
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.ingest import recognise
-from hnerf.capture.lens import Lens
+from hnerf.capture.lens import Lens, undistort_points
 from hnerf.capture.safe_io import path_in_capture
 from hnerf.capture.uncalibrated import read_lenses
 from hnerf.errors import InputError
@@ -81,7 +81,9 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     _check_board_found(footage)
     lenses, intrinsics = _intrinsics(folder, footage)
     corners_m = footage.board.corners_m
-    corners_px = np.stack([rig.undistort_corners(footage.corners_px[name], lens) for name, lens in lenses.items()])
+    corners_px = np.stack(
+        [undistort_points(footage.corners_px[name], lens.K, lens.distortion) for name, lens in lenses.items()]
+    )
     cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
     fit = rig.solve_rig(cameras, corners_m, rig.planar_corners(corners_m, corners_px), footage.frame_step)

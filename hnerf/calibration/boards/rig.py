@@ -9,8 +9,6 @@ import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from hnerf.calibration.boards.bundle import Adjustment, BoardFit, Poses
-from hnerf.capture.lens import Lens
-from hnerf.capture.normalise import UNDISTORTED
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
@@ -153,12 +151,6 @@ def _board_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: n
         if total_px < best_px[f]:
             R[f], t_m[f], best_px[f] = world_R, world_t_m, total_px
     return Poses(R, t_m)
-
-
-def undistort_corners(corners_px: np.ndarray, lens: Lens) -> np.ndarray:
-    """Map pixels (..., 2) as recorded to those of the pinhole camera with the same K; NaN stays."""
-    flat = cv2.undistortPoints(corners_px.reshape(-1, 1, 2), lens.K, lens.distortion, P=lens.K, criteria=UNDISTORTED)
-    return flat.reshape(corners_px.shape)
 
 
 def _relative_pose(a: Pose, b: Pose) -> Pose:

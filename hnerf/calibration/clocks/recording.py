@@ -12,6 +12,7 @@ from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.capture.clocks import frame_times_s
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.ingest import DEFAULT_FPS, ingest, recognise
+from hnerf.capture.lens import Lens, undistort_points
 from hnerf.capture.manifest import read_manifest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
@@ -33,11 +34,11 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
     if not names:
         raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to synchronise; add the recordings")
     fps = read_manifest(folder).fps or DEFAULT_FPS
-    tracks, sounds = dict[str, Track](), dict[str, np.ndarray]()
+    lenses, tracks, sounds = _calibration(folder, names), dict[str, Track](), dict[str, np.ndarray]()
     for name in names:
         footage = Uncalibrated(folder).footage(name)
         with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
-            tracks[name] = _track(folder, name, footage, fps, Path(scratch))
+            tracks[name] = _track(folder, name, footage, fps, lenses.get(name), Path(scratch))
         sound = read_sound(footage.path) if isinstance(footage, Video) else None
         if sound is not None:
             sounds[name] = sound
@@ -48,30 +49,32 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
             near_s[a, b] = found_s
     heard = {name for pair in near_s for name in pair}
     sources = {name: "keypoints and sound" if name in heard else "keypoints" for name in names}
+    cameras = {name: Camera(name, lens.K, lens.R, lens.t_m, 1, 1) for name, lens in lenses.items()}
     try:
-        return estimate_clocks(tracks, _calibrated(folder, names), near_s), sources
+        return estimate_clocks(tracks, cameras or None, near_s), sources
     except InputError as error:
         raise InputError(f"{folder}: {error}") from None
 
 
-def _track(folder: Path, name: str, footage: Footage, fps: float, scratch: Path) -> Track:
-    """Return the subject's keypoints in all frames of one camera, in recorded pixels."""
+def _track(folder: Path, name: str, footage: Footage, fps: float, lens: Lens | None, scratch: Path) -> Track:
+    """Return the subject's keypoints in all frames of one camera, in recorded pixels, undistorted if the lens is
+    known."""
     alone = Uncalibrated(folder, only=name)
     settings = CaptureSettings(max_frames=MAX_FRAMES)
     capture = with_keypoints(ingest(folder, settings, scratch / "capture", alone), scratch / "detected")
     keypoints = subject_keypoints(capture)[name]
     scale = np.array(capture.recorded_sizes_px[name]) / capture.cameras[name].size_px
     keypoints[..., :2] = keypoints[..., :2] * scale + (scale - 1) / 2
+    if lens is not None and name not in capture.recorded_lenses:  # by which its images would be undistorted
+        keypoints[..., :2] = undistort_points(keypoints[..., :2], lens.K, lens.distortion)
     rows = np.searchsorted(footage.frames, capture.frames)
     return Track(frame_times_s(footage, fps)[rows], keypoints)
 
 
-def _calibrated(folder: Path, names: list[str]) -> dict[str, Camera] | None:
-    """Return the cameras of the folder's calibration, if it has one of all cameras."""
+def _calibration(folder: Path, names: list[str]) -> dict[str, Lens]:
+    """Return the lenses of the folder's calibration; none if it has none, or not of all cameras."""
     try:
         lenses = recognise(folder).lenses()
     except InputError:
-        return None
-    if set(names).difference(lenses):
-        return None
-    return {name: Camera(name, lens.K, lens.R, lens.t_m, 1, 1) for name, lens in lenses.items()}
+        return {}
+    return {} if set(names).difference(lenses) else lenses

@@ -92,10 +92,14 @@ def falls_with_angle(result: Result) -> Iterator[Finding]:
 
 
 def ahead_at_every_angle(result: Result) -> Iterator[Finding]:
-    """Check that in every bin of angles H-NeRF is better than each other method."""
+    """Check that in every bin of angles H-NeRF is better than each other method; where it was tried and has no scores,
+    it is not."""
     for title, by_method in _angles(result):
-        for first in _h_nerf(result, by_method):
+        for first in _h_nerf(result, result["variants"][title]["methods"]):
             for name in _others(result, by_method):
+                if first not in by_method:
+                    yield False, f"{title}: {first} nothing, {name} has scores"
+                    continue
                 both = zip(by_method[first], by_method[name], strict=True)
                 leads = [mine - other for (_, mine, _), (_, other, _) in both]
                 yield min(leads) > 0, f"{title}: {min(leads):+.1f} to {max(leads):+.1f} dB to {name}"

@@ -17,7 +17,6 @@ from hnerf.calibration.boards.rig import (
     planar_corners,
     solve_boards,
     solve_rig,
-    undistort_corners,
 )
 from hnerf.capture.board_footage import Board, BoardCorners, BoardFootage
 from hnerf.capture.formats.caliscope import Caliscope
@@ -226,23 +225,6 @@ def test_intrinsics_need_no_poses_beside_them(tmp_path: Path, kind: str) -> None
     footage = BoardFootage(tmp_path, BOARD, (0,), 1, {"cam_7": np.full((1, 20, 2), np.nan)}, {"cam_7": (1000, 1000)})
     lenses, words = calibration_boards._intrinsics(tmp_path, footage)
     assert lenses["cam_7"].K[0, 0] == 900 and words["cam_7"].startswith("given; not verified")
-
-
-def test_undistortion_keeps_what_is_absent_absent() -> None:
-    lens = Lens("a", np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([0.1, 0, 0, 0]), np.eye(3),
-                np.zeros(3), None)  # fmt: skip
-    # At radius 1 the lens pictures 1 + 0.1; so pixel 50 + 110 is that of 50 + 100 without distortion.
-    flat = undistort_corners(np.array([[[160.0, 50], [np.nan, np.nan]]]), lens)
-    assert flat[0, 0].tolist() == pytest.approx([150, 50], abs=0.01) and np.isnan(flat[0, 1]).all()
-
-
-def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:
-    lens = Lens("a", np.array([[1100.0, 0, 960], [0, 1100, 540], [0, 0, 1]]), np.array([-0.25, 0.05, 0, 0]), np.eye(3),
-                np.zeros(3), None)  # fmt: skip
-    straight = np.array([[100.0, 100], [1800, 60], [960, 540], [200, 1000]])
-    directions = np.c_[(straight - (960, 540)) / 1100, np.ones(4)]
-    bent = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
-    np.testing.assert_allclose(undistort_corners(bent, lens), straight, atol=0.01)
 
 
 def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

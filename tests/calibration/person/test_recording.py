@@ -11,8 +11,9 @@ from flows.cli import main
 from hnerf.calibration.bundle import align
 from hnerf.calibration.clocks.recording import _track
 from hnerf.capture.clocks import read_clocks
-from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.capture.formats.easymocap import EasyMocap, write_easymocap
 from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.lens import Lens
 from hnerf.capture.uncalibrated import Uncalibrated
 from hnerf.geometry.camera import Camera
 from tests.calibration.clocks.test_clocks import filmed
@@ -67,9 +68,22 @@ def test_tracks_are_in_pixels_of_the_recording(tmp_path: Path) -> None:
     """Its pictures are shrunk to 1024 px."""
     seen = filmed(0, 0.1, 0.0).keypoints * [2.048, 2.048, 1]
     folder = write_recording(tmp_path / "film", {"c0": seen}, side_px=2048)
-    track = _track(folder, "c0", Uncalibrated(folder).footage("c0"), 30.0, tmp_path)
+    track = _track(folder, "c0", Uncalibrated(folder).footage("c0"), 30.0, None, tmp_path)
     np.testing.assert_allclose(track.keypoints, seen, atol=1e-3)
     np.testing.assert_allclose(track.times_s, [0, 1 / 30, 2 / 30])
+
+
+def test_tracks_are_undistorted_once_by_a_lens_that_is_known(tmp_path: Path) -> None:
+    """At radius 0.4 a lens of k1 = 0.25 pictures 0.4 (1 + 0.04): 500 + 416 px is 500 + 400 without distortion. Images
+    that `intri.yml` undistorts have these pixels already."""
+    K, distortion = np.array([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]]), np.array([0.25, 0, 0, 0])
+    lens = Lens("c0", K, distortion, np.eye(3), np.zeros(3), (1000, 1000))
+    seen = np.broadcast_to([916.0, 500.0, 0.8], (3, 25, 3)) + 1e-3 * np.arange(25)[:, None] * [0, 1, 0]
+    folder = write_recording(tmp_path / "film", {"c0": seen})
+    for scratch in (tmp_path / "given", tmp_path / "read"):
+        track = _track(folder, "c0", Uncalibrated(folder).footage("c0"), 30.0, lens, scratch)
+        assert track.keypoints[0, 0].tolist() == pytest.approx([900, 500, 0.8], abs=0.05)
+        write_easymocap(folder, [lens])
 
 
 def test_a_folder_without_recordings_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -121,6 +121,8 @@ def test_quality_falls_with_the_angle_and_who_is_ahead_at_each() -> None:
     ahead = verdict(synthetic_result("ahead_at_every_angle"))
     assert ahead == "yes: 4 cameras: +4.0 to +4.0 dB to nerf; 2 cameras: +8.0 to +8.0 dB to nerf."
     assert verdict(synthetic_result("ahead_at_every_angle", nerf={4: (31.0, 0.5, 0.05)})).startswith("no: ")
+    failed = verdict(without_fast("ahead_at_every_angle", 4))
+    assert failed.startswith("no: 4 cameras: fast nothing, nerf has scores; 2 cameras: +8.0")
 
 
 @pytest.mark.parametrize(("slope", "seen"), [(0.0, "yes: 4 cameras: correlation -0.32 over 4 images"), (0.1, "no: ")])

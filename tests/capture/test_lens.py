@@ -1,0 +1,20 @@
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.capture.lens import undistort_points
+
+
+def test_undistortion_keeps_what_is_absent_absent() -> None:
+    """At radius 1 the lens pictures 1 + 0.1: pixel 50 + 110 is that of 50 + 100 without distortion."""
+    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    flat = undistort_points(np.array([[[160.0, 50], [np.nan, np.nan]]]), K, np.array([0.1, 0, 0, 0]))
+    assert flat[0, 0].tolist() == pytest.approx([150, 50], abs=0.01) and np.isnan(flat[0, 1]).all()
+
+
+def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:
+    K, distortion = np.array([[1100.0, 0, 960], [0, 1100, 540], [0, 0, 1]]), np.array([-0.25, 0.05, 0, 0])
+    straight = np.array([[100.0, 100], [1800, 60], [960, 540], [200, 1000]])
+    directions = np.c_[(straight - (960, 540)) / 1100, np.ones(4)]
+    bent = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
+    np.testing.assert_allclose(undistort_points(bent, K, distortion), straight, atol=0.01)
