@@ -12,12 +12,13 @@ from hnerf.fields.rays import Rays
 from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
 
 SMALL = [
-    "training.steps=300",
-    "training.rays_per_frame=256",
+    "training.steps=150",
+    "training.rays_per_frame=128",
     "training.field.width=32",
     "training.field.samples=16",
+    "training.field.learning_rate=0.003",
 ]
-FEWER = ["training.steps=200", "training.rays_per_frame=96"]  # for two pictures
+FEWER = ["training.steps=100", "training.rays_per_frame=96"]  # for two pictures
 AXES = torch.cat([torch.eye(3), -torch.eye(3)])
 
 

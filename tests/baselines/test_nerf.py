@@ -21,11 +21,11 @@ from hnerf.training.losses import Target, blend, reconstruction
 from tests.baselines.ball import RING, body, inner_psnr, psnr, record, trained
 
 SMALL = [
-    "training.steps=250",
-    "training.rays_per_frame=256",
+    "training.steps=200",
+    "training.rays_per_frame=192",
     "training.field.width=32",
     "training.field.samples=16",
-    "training.field.learning_rate=0.01",
+    "training.field.learning_rate=0.015",
 ]
 FEWER = ["training.steps=150", "training.rays_per_frame=96"]  # for two pictures
 

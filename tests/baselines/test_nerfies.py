@@ -22,12 +22,12 @@ from hnerf.fields.samples import RaySamples
 from tests.baselines.column import Learned, learn, three_poses
 
 SMALL = [
-    "training.steps=90",
+    "training.steps=60",
     "training.rays_per_frame=64",
     "training.field.samples=12",
     "training.field.width=32",
     "training.field.anneal_share=0.3333",
-    "training.field.learning_rate=0.01",
+    "training.field.learning_rate=0.015",
 ]
 
 
@@ -163,9 +163,9 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
 
 
 def test_overfits_two_frames(learned: Learned) -> None:
-    """28 dB in both, with progress noted up to the last step."""
-    assert learned.avatar.field.progress == pytest.approx(89 / 90)
-    assert min(learned.psnr(frame) for frame in (0, 1)) > 28
+    """27 dB in both, with progress noted up to the last step."""
+    assert learned.avatar.field.progress == pytest.approx(59 / 60)
+    assert min(learned.psnr(frame) for frame in (0, 1)) > 27
 
 
 def test_a_pose_that_no_frame_has_shows_the_template(learned: Learned) -> None:

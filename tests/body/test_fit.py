@@ -117,7 +117,7 @@ def test_a_stature_that_one_camera_tells_is_doubted_beyond_one_and_a_half_standa
 
 def test_before_one_camera_somebody_stands_on_his_soles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(contour_fit, "_sole_m", lambda *_: 0.03)
-    truth = moving_body((0, 1, 2, 3))
+    truth = moving_body((0, 1))
     truth.root[:, 2, 3] += 0.03
     capture = record(tmp_path, truth, RING, ("0",))
     fit, _ = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=6))
