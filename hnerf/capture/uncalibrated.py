@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hnerf.capture.footage import Footage, Video
+from hnerf.capture.footage import Footage
 from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.pose2sim import Pose2Sim, lens_from_table
@@ -16,7 +16,6 @@ from hnerf.capture.safe_io import (
     VIDEO_SUFFIXES,
     by_camera,
     check_camera_name,
-    file_named,
     files_in,
     path_in_capture,
     read_toml,
@@ -78,9 +77,8 @@ class Uncalibrated(Layout):
         return {name: known.lens for name, known in self.known_lenses.items()}
 
     def footage(self, camera: str) -> Footage:
-        """Return images/<camera>/, videos/<camera>.mp4 or <camera>.mp4."""
-        beside = file_named(self.folder, camera, suffixes=VIDEO_SUFFIXES)
-        return Video.open(beside) if beside.exists() else EasyMocap(self.folder).footage(camera)
+        """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""
+        return EasyMocap(self.folder).footage(camera)
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return openpose/<camera>/, else pose/<camera>_json/."""

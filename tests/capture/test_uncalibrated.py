@@ -105,6 +105,12 @@ def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> No
     assert capture.cameras["left"].K[0, 0] == pytest.approx(0.85 * 96)
 
 
+def test_images_come_before_a_video_of_the_same_name(tmp_path: Path) -> None:
+    write_images(tmp_path, "left")
+    write_video(tmp_path / "left.mp4")
+    assert Uncalibrated(tmp_path).footage("left").frames == (0, 1)  # the video has three
+
+
 @pytest.mark.parametrize("place", ["", "videos"])
 def test_two_videos_of_one_name_are_refused_and_sound_is_none(tmp_path: Path, place: str) -> None:
     write_video(tmp_path / place / "ada.mp4")
