@@ -37,7 +37,7 @@ def walk_pose(rig: Rig, time_s: float, waving: float) -> WalkPose:
     heading = np.radians(TURN_DEGPS) * time_s
     root = torch.eye(4)
     root[:3, :3] = torch.from_numpy(Rotation.from_euler("z", heading).as_matrix())
-    root[:2, 3] = CIRCLE_RADIUS_M * torch.tensor([np.cos(heading), np.sin(heading)])
+    root[:2, 3] = -CIRCLE_RADIUS_M * torch.tensor([np.cos(heading), np.sin(heading)])
     return WalkPose(theta, root, phase)
 
 
