@@ -195,16 +195,12 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
     person = command.add_argument_group("from the person")
     person.add_argument(
         "--height",
-        **_number(
-            float, *STATURE_M, "M", "the person's height (default: stature_m of capture.toml, else the mean of adults)"
-        ),
+        **_number(float, *STATURE_M, "M", "the person's height (default: stature_m of capture.toml, else 1.65)"),
     )
     person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML file")
     person.add_argument(
         "--fov",
-        **_number(
-            float, 1, 170, "DEG", "field of view across the longer side (default: from metadata, else estimated)"
-        ),
+        **_number(float, 1, 170, "DEG", "field of view across the longer side (default: metadata, else estimated)"),
     )
 
 
@@ -292,11 +288,7 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     render.add_argument(
         "--height",
         **_number(
-            float,
-            -MAX_M,
-            MAX_M,
-            "M",
-            "height of the orbit above the person's middle (default: that of the recorded cameras)",
+            float, -MAX_M, MAX_M, "M", "height above the person's middle (default: that of the recorded cameras)"
         ),
     )
     render.add_argument(

@@ -70,9 +70,7 @@ class DetectionSettings(Section):
 class CalibrationSettings(Section):
     """Settings of the calibration check and of the refinement of cameras."""
 
-    max_residual_px: float = Field(
-        default=5.0, gt=0
-    )  # limit of a camera's median; scales up if the person exceeds 357 px
+    max_residual_px: float = Field(default=5.0, gt=0)  # limit of a camera's median; more for persons over 357 px
     min_improvement: float = Field(default=0.02, ge=0, lt=1)  # a correction must lower held-out residuals by this share
 
 
@@ -103,9 +101,7 @@ class FitSettings(Section):
     stature_std_m: float = Field(default=0.08, gt=0)  # std of the height of people
     phenotype_std: float = Field(default=0.25, gt=0)  # std of anny's phenotype values
     local_change_std: float = Field(default=0.3, gt=0)  # std of anny's local shape changes
-    acceleration_mps2: float = Field(
-        default=10.0, gt=0
-    )  # std, of the trunk; knees and elbows 2, hands and feet 3 to 4 times
+    acceleration_mps2: float = Field(default=10.0, gt=0)  # std of the trunk; limbs have two to four times as much
     inside_m: float = Field(default=0.008, gt=0)  # std of residuals where the mask's edge lies inside the body
     outside_m: float = Field(default=0.02, gt=0)  # std of residuals where the mask's edge lies outside the body
     clothing_m: float = Field(default=0.08, gt=0)  # cloth and hair farther out do not pull the body outwards
@@ -155,8 +151,8 @@ class PaperFieldSettings(FieldSettings):
     tunes_poses: ClassVar[bool] = True
     kind: Literal["paper"] = "paper"
     samples: int = Field(default=256, ge=2)  # coarse samples per ray, and as many fine ones
-    box_samples: int = Field(default=0, ge=0)  # coarse samples placed only in the person's box
-    rays: Literal["image", "box"] = "image"  # train on all pixels, or on those that look into the person's box
+    box_samples: int = Field(default=0, ge=0)  # how many of the coarse samples lie in the person's box only
+    rays: Literal["image", "box"] = "image"  # train on all pixels, or on those whose rays meet the person's box
     gamma: float = Field(default=200.0, gt=0)  # sharpness of the surface, per scene unit
     learning_rate: float = Field(default=1e-3, gt=0)
     root_condition: bool = True  # whether colour depends on the root transform T
@@ -288,7 +284,7 @@ class EvaluationSettings(Section):
     max_meshes: int = Field(default=4, ge=1)  # per split
     max_images: int | None = Field(default=None, ge=1)  # per split; null: all
     report_rows: int = Field(default=3, ge=1)  # frames shown per split
-    holdout: str | None = None  # a camera, or each in turn: train without it, score on it
+    holdout: str | None = None  # a camera, or "each" in turn: train without it, score on it
 
 
 class AssetSettings(Section):

@@ -176,9 +176,9 @@ def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keyp
     scene.add_camera_with_trivial_rig(
         pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", params=[fx, cx, cy], **size)
     )
-    skewed_px = camera.K[0, 1] / camera.K[1, 1] * (keypoints_px[:, 1:] - camera.K[1, 2])
-    points = (keypoints_px - np.pad(skewed_px, ((0, 0), (0, 1)))) * aspect
-    image = pycolmap.Image(camera.name, np.ascontiguousarray(points), number, number)
+    straight_px = keypoints_px.copy()
+    straight_px[:, 0] -= camera.K[0, 1] / camera.K[1, 1] * (keypoints_px[:, 1] - camera.K[1, 2])
+    image = pycolmap.Image(camera.name, np.ascontiguousarray(straight_px * aspect), number, number)
     scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
 
 

@@ -151,13 +151,15 @@ class NearHull:
         slightly different ones of the same names, for each of the replacements: (replacements, n). Only rays that end
         near an outline are searched, and only where they pass the hull closest before."""
         near_hull = [near for rows in self.by_camera.values() for near in rows]
-        before_px = np.concatenate([np.zeros(0), *(near.closest_px() for near in near_hull)])
+        if not near_hull:
+            return np.zeros((len(replacements), 0))
+        before_px = np.concatenate([near.closest_px() for near in near_hull])
         close = before_px > -SLIGHT_CHANGE_PX
         starts = np.cumsum([0, *(len(near.along_m) for near in near_hull)])
         searched = [near.only(close[start:end]) for near, (start, end) in zip(near_hull, pairwise(starts), strict=True)]
         changed_px = np.zeros((len(replacements), len(close)))
         for i, replaced in enumerate(replacements):
-            after_px = np.concatenate([np.zeros(0), *(near.replaced(replaced).closest_px() for near in searched)])
+            after_px = np.concatenate([near.replaced(replaced).closest_px() for near in searched])
             changed_px[i, close] = after_px.clip(0) - before_px[close].clip(0)
         return changed_px
 

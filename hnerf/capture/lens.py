@@ -41,6 +41,8 @@ def pinhole(camera: Camera) -> Lens:
 
 def undistort_points(points_px: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     """Map pixels (..., 2) of a recorded image to those of the pinhole camera with the same K; NaN stays."""
+    if points_px.size == 0:  # for which OpenCV returns None
+        return points_px
     flat = np.ascontiguousarray(points_px.reshape(-1, 1, 2))
     return cv2.undistortPoints(flat, K, distortion, P=K, criteria=UNDISTORTED).reshape(points_px.shape)
 

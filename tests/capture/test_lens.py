@@ -10,6 +10,7 @@ def test_undistortion_keeps_what_is_absent_absent() -> None:
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
     flat = undistort_points(np.array([[[160.0, 50], [np.nan, np.nan]]]), K, np.array([0.1, 0, 0, 0]))
     assert flat[0, 0].tolist() == pytest.approx([150, 50], abs=0.01) and np.isnan(flat[0, 1]).all()
+    assert undistort_points(np.zeros((0, 2)), K, np.array([0.1, 0, 0, 0])).shape == (0, 2)
 
 
 def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:

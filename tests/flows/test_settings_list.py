@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 from typing import Literal
 
@@ -6,6 +7,7 @@ from pydantic import BaseModel, Field, PositiveInt
 
 from flows.cli import main
 from flows.settings_list import settings_list
+from hnerf import config
 from hnerf.config import Section, Settings, SyntheticSettings, load_settings, overridden
 
 
@@ -27,6 +29,12 @@ class Scene(Section):
     shape: Cube | Ball = Field(default=Cube(), discriminator="kind")
     share: float = Field(default=0.25, ge=0, lt=1)
     floor: Path | None = None  # a picture; None: grey
+
+
+def test_no_setting_is_wrapped_before_its_comment() -> None:
+    """The list takes a comment from the line on which the setting begins."""
+    wrapped = re.findall(r"^    (\w+): .*\($", Path(config.__file__).read_text(), re.MULTILINE)
+    assert wrapped == []
 
 
 def test_a_line_has_key_value_type_bounds_and_comment() -> None:
