@@ -14,10 +14,13 @@ MOST_AT_ONCE = 4  # each takes up to a GiB
 CPU = torch.device("cpu")
 
 
-def side_by_side(work: Callable[[T], R], items: Iterable[T], device: torch.device = CPU) -> Iterator[R]:
+def side_by_side(
+    work: Callable[[T], R], items: Iterable[T], device: torch.device = CPU, threads: int | None = None
+) -> Iterator[R]:
     """Yield work(item) of each item in order: one after another on a GPU, in several threads on a CPU, which divide
-    those of torch among them. What is ready and not yet taken is at most one more than there are threads."""
-    threads = torch.get_num_threads()
+    `threads` of torch among them, all by default. What is ready and not yet taken is at most one more than there are
+    threads."""
+    threads = threads or torch.get_num_threads()
     workers = min(threads, MOST_AT_ONCE) if device.type == "cpu" else 1
     if workers == 1:
         yield from map(work, items)

@@ -31,6 +31,14 @@ def test_a_gpu_does_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(side_by_side(lambda _: threading.get_ident(), range(3), GPU)) == [here] * 3
 
 
+def test_as_many_threads_as_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A limit on torch's threads, as while a body is fitted, does not hold for work side by side."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
+    barrier = threading.Barrier(2)
+    assert sorted(side_by_side(lambda _: barrier.wait(timeout=10), range(2), CPU, threads=2)) == [0, 1]
+
+
 def test_what_fails_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     monkeypatch.setattr(torch, "set_num_threads", lambda _: None)

@@ -45,14 +45,19 @@ class Points:
 @dataclass(frozen=True)
 class PosedJoints:
     """Moving joints in the world: rotations (n, M, 3, 3); positions_m (n, M, 3); axes (n, M, 3, 3), whose columns are
-    the world rotation vectors of the joint's three unknowns; shape_m (n, M, 3, B), displacement per unit of beta;
-    bent_m (n, K, 3): what turns of locked joints add to the vertices `bent` (K,), by way of
-    the moving joints `bent_by` (K,)."""
+    the world rotation vectors of the joint's three unknowns; shape_m (n, M, 3, B), displacement per unit of beta."""
 
     rotations: Tensor
     positions_m: Tensor
     axes: Tensor
     shape_m: Tensor
+
+
+@dataclass(frozen=True)
+class PosedSkin(PosedJoints):
+    """Moving joints, and what they leave out of the skin. bent_m (n, K, 3): what turns of locked joints add to the
+    vertices `bent` (K,), by way of the moving joints `bent_by` (K,)."""
+
     bent: Tensor
     bent_by: Tensor
     bent_m: Tensor
@@ -104,6 +109,11 @@ class Articulation:
         axes = above @ left_jacobian(pose.theta[:, self.joints])
         axes[:, 0] = torch.eye(3, dtype=axes.dtype)
         shape = posed_joint_basis(self.rig, world, pose.root)[:, self.joints]
+        return PosedJoints(rotations, positions, axes, shape)
+
+    def skin(self, pose: Pose) -> PosedSkin:
+        """Place the moving joints and the skin in the world."""
+        joints = self.pose(pose)
         bent, bent_by = self._bent_vertices(pose.theta)
         part = replace(
             self.rig,
@@ -111,8 +121,8 @@ class Articulation:
             skin_joints=self.rig.skin_joints[bent],
             skin_weights=self.rig.skin_weights[bent],
         )
-        bent_m = pose_vertices(part, pose.theta, pose.root) - self._rigid(bent, rotations, positions)
-        return PosedJoints(rotations, positions, axes, shape, bent, bent_by, bent_m)
+        bent_m = pose_vertices(part, pose.theta, pose.root) - self._rigid(bent, joints.rotations, joints.positions_m)
+        return PosedSkin(**vars(joints), bent=bent, bent_by=bent_by, bent_m=bent_m)
 
     def _bent_vertices(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Return the vertices (K,) on locked joints that have a turn in some frame, or on joints below them, and the
@@ -126,18 +136,17 @@ class Articulation:
         slot = on_turned[bent].int().argmax(1)
         return bent, self.carrier[self.rig.skin_joints[bent, slot]]
 
-    def _rigid(self, ids: Tensor, rotations: Tensor, positions_m: Tensor) -> Tensor:
+    def _rigid(self, ids: Tensor | slice, rotations: Tensor, positions_m: Tensor) -> Tensor:
         """Return vertices `ids` (K,) as the moving joints carry them, (..., K, 3) world: rotations (..., M, 3, 3) and
         positions_m (..., M, 3) of these."""
         moved = positions_m - (rotations @ self.rest_m[..., None])[..., 0]
         blended = self.vertex_weights[ids] @ torch.cat([rotations.flatten(-2), moved], -1)
         return (blended[..., :9].unflatten(-1, (3, 3)) @ self.rig.vertices_m[ids, :, None])[..., 0] + blended[..., 9:]
 
-    def surface(self, joints: PosedJoints, frame: int) -> Tensor:
+    def surface(self, skin: PosedSkin, frame: int) -> Tensor:
         """Return every vertex in one frame, (V, 3) world."""
-        everything = torch.arange(len(self.rig.vertices_m))
-        surface = self._rigid(everything, joints.rotations[frame], joints.positions_m[frame])
-        surface[joints.bent] += joints.bent_m[frame]
+        surface = self._rigid(slice(None), skin.rotations[frame], skin.positions_m[frame])
+        surface[skin.bent] += skin.bent_m[frame]
         return surface
 
     def jacobian(self, points: Points, joints: PosedJoints) -> tuple[Tensor, Tensor, Tensor]:
@@ -157,23 +166,23 @@ class Articulation:
         return position, frame, shape
 
     def directional_jacobian(
-        self, ids: Tensor, directions: Tensor, joints: PosedJoints, frame: int
+        self, ids: Tensor, directions: Tensor, skin: PosedSkin, frame: int
     ) -> tuple[Tensor, Tensor]:
         """Return derivatives of the positions of vertices `ids` (P,) along directions (P, 3): by the frame's unknowns
         (P, U), and by beta (P, B). Equal to `jacobian` times the directions, without forming it."""
         weights, rest = self.vertex_weights[ids], self.rig.vertices_m[ids, None] - self.rest_m
-        rotations, positions = joints.rotations[frame], joints.positions_m[frame]
+        rotations, positions = skin.rotations[frame], skin.positions_m[frame]
         carried = weights[..., None] * (torch.einsum("mcd,pmd->pmc", rotations, rest) + positions)
-        bent = torch.searchsorted(joints.bent, ids.contiguous()).clamp(max=max(len(joints.bent) - 1, 0))
-        rows = (joints.bent[bent] == ids).nonzero()[:, 0] if len(joints.bent) else ids[:0]
-        carried[rows, joints.bent_by[bent[rows]]] += joints.bent_m[frame, bent[rows]]
+        bent = torch.searchsorted(skin.bent, ids.contiguous()).clamp(max=max(len(skin.bent) - 1, 0))
+        rows = (skin.bent[bent] == ids).nonzero()[:, 0] if len(skin.bent) else ids[:0]
+        carried[rows, skin.bent_by[bent[rows]]] += skin.bent_m[frame, bent[rows]]
         lever = torch.einsum("jm,pmd->pjd", self.subtree, carried) - (weights @ self.subtree.T)[..., None] * positions
         torque = torch.linalg.cross(lever, directions[:, None].expand_as(lever))
-        by_rotation = torch.einsum("pmc,mcu->pmu", torque, joints.axes[frame]).flatten(1)
+        by_rotation = torch.einsum("pmc,mcu->pmu", torque, skin.axes[frame]).flatten(1)
         pulled = weights[..., None] * torch.einsum("pc,mcd->pmd", directions, rotations)
         shape = torch.einsum("pd,bpd->pb", pulled.sum(1), self.rig.shape_basis[:, ids])
         shape -= pulled.flatten(1) @ self.rest_basis_m.flatten(0, 1)
-        shape += (weights[..., None] * directions[:, None]).flatten(1) @ joints.shape_m[frame].flatten(0, 1)
+        shape += (weights[..., None] * directions[:, None]).flatten(1) @ skin.shape_m[frame].flatten(0, 1)
         return torch.cat([directions, by_rotation], 1), shape
 
     def _weighted_positions(self, points: Points, joints: PosedJoints) -> Tensor:

@@ -7,6 +7,7 @@ vertex normals; the residuals that are left pull the body in both directions.
 
 import logging
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
@@ -15,11 +16,12 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.contour_fit import DAMPING, ContourResiduals, Outline, add_residuals, rim_in_image
+from hnerf.body.contour_fit import DAMPING, ContourResiduals, Outline, add_residuals, rim_in_image, rms_mm
 from hnerf.body.descriptor import normals_of
 from hnerf.body.keypoint_fit import Problem
 from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
+from hnerf.side_by_side import side_by_side
 
 log = logging.getLogger("hnerf.fit")
 
@@ -31,39 +33,46 @@ EDGE_STD_M, OUTLIER_M = 0.006, 0.02  # of a mask's edge about the clothed body, 
 SMOOTHNESS_WEIGHT, SKIN_WEIGHT = 2.0, 0.02  # in matches: of equal offsets at neighbours, and of no offset
 
 
-def refine_with_clothing(problem: Problem, pose: Pose, edges: list[list[Outline | None]]) -> Pose:
+def refine_with_clothing(problem: Problem, pose: Pose, edges: list[list[Outline | None]], threads: int) -> Pose:
     """Refine a pose by Gauss-Newton steps on outlines and keypoints of a clothed body.
 
     Before each step matches are made anew and the cloth offsets solved for. edges: by frame and camera, None without a
-    mask. The pose is returned unchanged with one camera, which hardly distinguishes clothes from a body that is nearer,
-    and with few frames.
+    mask; threads: for frames side by side. The pose is returned unchanged with one camera, which hardly distinguishes
+    clothes from a body that is nearer, and with few frames.
     """
     if len(problem.observations.cameras) == 1 or sum(any(row) for row in edges) < MIN_FRAMES:
         return pose
-    faces = pose.rig.faces.numpy()
     cloth_offset_m = np.zeros(len(pose.rig.vertices_m))
     for step in tracked(range(CLOTHED_STEPS), "clothes", CLOTHED_STEPS):
-        articulation = Articulation(pose.rig)
-        joints = articulation.pose(pose)
-        found = []
-        for t, row in enumerate(edges):
-            vertices_m = articulation.surface(joints, t).numpy()
-            normals = normals_of(vertices_m, faces)
-            clothed_m = vertices_m + cloth_offset_m[:, None] * normals
-            views = zip(problem.observations.cameras, problem.scale_m, row, strict=True)
-            found += [
-                (t, match_clothed(c, e, float(s[t]), clothed_m, normals, faces)) for c, s, e in views if e is not None
-            ]
-        before_m = cloth_offset_m
-        cloth_offset_m = solve_cloth_offset(before_m, [rows for _, rows in found], faces)
-        found = [(t, _with_more_cloth(rows, cloth_offset_m - before_m)) for t, rows in found]
-        _, equations = problem.assemble(pose, problem.image_term)
-        for t, rows in found:
-            add_residuals(equations, articulation, joints, t, replace(rows, weight=rows.weight / EDGE_STD_M**2))
-        pose = problem.apply_step(pose, equations, DAMPING)
-        left_mm = 1e3 * np.concatenate([rows.residual_m for _, rows in found])
-        log.info("clothes, step %d of %d: %.1f mm rms", step + 1, CLOTHED_STEPS, np.sqrt((left_mm**2).mean()))
+        pose, cloth_offset_m, left_mm = _clothed_step(problem, pose, edges, cloth_offset_m, threads)
+        log.info("clothes, step %d of %d: %.1f mm rms", step + 1, CLOTHED_STEPS, left_mm)
     return pose
+
+
+def _clothed_step(
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], before_m: np.ndarray, threads: int
+) -> tuple[Pose, np.ndarray, float]:
+    """Return the pose after one step, the cloth offsets (V,) metres, and the residuals before the step (root mean
+    square, mm). before_m: the offsets of the step before."""
+    faces = pose.rig.faces.numpy()
+    articulation = Articulation(pose.rig)
+    skin = articulation.skin(pose)
+
+    def match_frame(t: int) -> list[tuple[int, ContourResiduals]]:
+        vertices_m = articulation.surface(skin, t).numpy()
+        normals = normals_of(vertices_m, faces)
+        clothed_m = vertices_m + before_m[:, None] * normals
+        views = zip(problem.observations.cameras, problem.scale_m, edges[t], strict=True)
+        return [(t, match_clothed(c, e, float(s[t]), clothed_m, normals, faces)) for c, s, e in views if e is not None]
+
+    found = [*chain.from_iterable(side_by_side(match_frame, range(len(edges)), threads=threads))]
+    cloth_offset_m = solve_cloth_offset(before_m, [rows for _, rows in found], faces)
+    found = [(t, _with_more_cloth(rows, cloth_offset_m - before_m)) for t, rows in found]
+    _, equations = problem.assemble(pose, problem.image_term)
+    for t, rows in found:
+        add_residuals(equations, articulation, skin, t, replace(rows, weight=rows.weight / EDGE_STD_M**2))
+    pose = problem.apply_step(pose, equations, DAMPING)
+    return pose, cloth_offset_m, rms_mm([rows.residual_m for _, rows in found])
 
 
 def match_clothed(

@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from skimage.measure import find_contours
 
-from hnerf.body.articulation import Articulation, Pose, PosedJoints
+from hnerf.body.articulation import Articulation, Pose, PosedSkin
 from hnerf.body.descriptor import normals_of
 from hnerf.body.keypoint_fit import Problem
 from hnerf.body.normal_equations import NormalEquations
@@ -25,6 +25,7 @@ from hnerf.config import FitSettings
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
 from hnerf.progress import tracked
+from hnerf.side_by_side import side_by_side
 
 log = logging.getLogger("hnerf.fit")
 
@@ -156,42 +157,58 @@ def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.n
 
 
 def refine_with_outlines(
-    problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, ground: int | None
-) -> Pose:
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, ground: int | None,
+    threads: int,
+) -> Pose:  # fmt: skip
     """Refine a pose by Gauss-Newton steps on outlines and keypoints, with matches made anew before each step.
 
     edges: by frame and camera, None without a mask; ground: the world's vertical axis where a single camera sees a
-    person stand on height 0, else None.
+    person stand on height 0, else None; threads: for frames side by side.
     """
-    faces = pose.rig.faces.numpy()
-    only, sole_m = problem.observations.cameras[0], 0.0
+    sole_m = 0.0
     for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
-        articulation = Articulation(pose.rig)
-        joints = articulation.pose(pose)
-        _, equations = problem.assemble(pose, problem.image_term)
-        residuals, soles_m = [], []
-        for t, row in enumerate(edges):
-            vertices_m = articulation.surface(joints, t).numpy()
-            normals = normals_of(vertices_m, faces)
-            found = [
-                match(camera, edge, float(scale_m[t]), vertices_m, normals, faces, settings)
-                for camera, scale_m, edge in zip(problem.observations.cameras, problem.scale_m, row, strict=True)
-                if edge is not None
-            ]
-            if ground is not None:
-                found.append(_ground_contact(vertices_m, ground, sole_m))
-                found_m = [_sole_m(only, e, float(problem.scale_m[0, t]), vertices_m, ground) for e in row if e]
-                soles_m += [sole_m for sole_m in found_m if sole_m is not None]
-            for rows in found:
-                add_residuals(equations, articulation, joints, t, rows)
-                residuals.append(rows.residual_m)
-        pose = problem.apply_step(pose, equations, DAMPING)
-        sole_m = float(np.median(soles_m)) if soles_m else 0.0
-        error_mm = 1e3 * np.concatenate([np.zeros(0), *residuals])
-        log.info(
-            "outlines, step %d of %d: %.1f mm rms", step + 1, settings.contour_steps, np.sqrt((error_mm**2).mean())
-        )
+        pose, sole_m, rms_mm = _outline_step(problem, pose, edges, settings, ground, sole_m, threads)
+        log.info("outlines, step %d of %d: %.1f mm rms", step + 1, settings.contour_steps, rms_mm)
     return pose
+
+
+def _outline_step(
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, ground: int | None,
+    sole_m: float, threads: int,
+) -> tuple[Pose, float, float]:  # fmt: skip
+    """Return the pose after one step, the median height of the skin above the ground, and the residuals before the step
+    (root mean square, mm). sole_m: that height by the step before."""
+    faces, cameras = pose.rig.faces.numpy(), problem.observations.cameras
+    articulation = Articulation(pose.rig)
+    skin = articulation.skin(pose)
+    _, equations = problem.assemble(pose, problem.image_term)
+
+    def match_frame(t: int) -> tuple[list[ContourResiduals], list[float]]:
+        vertices_m = articulation.surface(skin, t).numpy()
+        normals = normals_of(vertices_m, faces)
+        found = [
+            match(camera, edge, float(scale_m[t]), vertices_m, normals, faces, settings)
+            for camera, scale_m, edge in zip(cameras, problem.scale_m, edges[t], strict=True)
+            if edge is not None
+        ]
+        if ground is None:
+            return found, []
+        soles_m = [_sole_m(cameras[0], e, float(problem.scale_m[0, t]), vertices_m, ground) for e in edges[t] if e]
+        return [*found, _ground_contact(vertices_m, ground, sole_m)], [m for m in soles_m if m is not None]
+
+    residuals_m, soles_m = [np.zeros(0)], []
+    for t, (found, found_m) in enumerate(side_by_side(match_frame, range(len(edges)), threads=threads)):
+        soles_m += found_m
+        for rows in found:
+            add_residuals(equations, articulation, skin, t, rows)
+            residuals_m.append(rows.residual_m)
+    pose = problem.apply_step(pose, equations, DAMPING)
+    return pose, float(np.median(soles_m)) if soles_m else 0.0, rms_mm(residuals_m)
+
+
+def rms_mm(residuals_m: list[np.ndarray]) -> float:
+    """Return the root mean square of residuals in metres, in millimetres."""
+    return 1e3 * float(np.sqrt((np.concatenate(residuals_m) ** 2).mean()))
 
 
 def _ground_contact(vertices_m: np.ndarray, up: int, sole_m: float) -> ContourResiduals:
@@ -219,11 +236,11 @@ def _sole_m(camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarra
 
 
 def add_residuals(
-    equations: NormalEquations, articulation: Articulation, joints: PosedJoints, frame: int, rows: ContourResiduals
+    equations: NormalEquations, articulation: Articulation, skin: PosedSkin, frame: int, rows: ContourResiduals
 ) -> None:
     """Add a frame's residuals to the normal equations."""
     ids, directions = torch.from_numpy(rows.vertices), torch.from_numpy(rows.gradient)
-    j, s = (part.numpy() for part in articulation.directional_jacobian(ids, directions, joints, frame))
+    j, s = (part.numpy() for part in articulation.directional_jacobian(ids, directions, skin, frame))
     shape = slice(0, s.shape[1])
     weighted_j, weighted_s = j * rows.weight[:, None], s * rows.weight[:, None]
     equations.frame[0][frame] += weighted_j.T @ j

@@ -61,6 +61,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
 
     Raises InputError where keypoints are missing or the person is seen by too few cameras in too many frames.
     """
+    threads = torch.get_num_threads()
     with threadpool_limits(1):  # tensors are so small that threads cost more time than they save
         seconds: dict[str, float] = {}
         if capture.stature_m:
@@ -103,9 +104,9 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 terms |= {"ground": Ground(up, each_foot=True)} if on_ground else {}
                 problem = replace(problem, palm=palm, posture_prior=posture_prior, **terms)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
-                pose = refine_with_outlines(problem, pose, edges, settings, up if on_ground else None)
+                pose = refine_with_outlines(problem, pose, edges, settings, up if on_ground else None, threads)
             with _timed(seconds, "clothes"):
-                pose = refine_with_clothing(problem, pose, edges)
+                pose = refine_with_clothing(problem, pose, edges, threads)
         if palm and masks is not None:
             with _timed(seconds, "fingers again"):
                 pose = fit_fingers(pose, palm.views, problem.scale_m, runs(capture), step_s)

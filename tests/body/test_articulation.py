@@ -50,15 +50,15 @@ def test_left_jacobian_turns_a_change_of_the_vector_into_a_rotation() -> None:
 def test_vertices_and_their_derivatives_agree_with_the_plain_rig() -> None:
     rig = anny_rig(torch.tensor(ADULT) + 0.05).to(dtype=torch.float64)
     pose, articulation = random_pose(rig, 2), Articulation(rig)
-    joints = articulation.pose(pose)
+    skin = articulation.skin(pose)
     vertices = pose_vertices(rig, pose.theta, pose.root)
     other = pose_vertices(rig.reshaped(rig.beta + 0.1), pose.theta, pose.root)
     by_shape = (other - vertices) / 0.1  # exact: beta acts linearly
     ids = torch.arange(0, len(rig.vertices_m), 331)
     numeric = numeric_jacobian(pose, ids)
-    torch.testing.assert_close(articulation.surface(joints, 1), vertices[1])
+    torch.testing.assert_close(articulation.surface(skin, 1), vertices[1])
     for axis, direction in enumerate(torch.eye(3, dtype=torch.float64)):
-        rows, shape = articulation.directional_jacobian(ids, direction.expand(len(ids), 3), joints, 1)
+        rows, shape = articulation.directional_jacobian(ids, direction.expand(len(ids), 3), skin, 1)
         torch.testing.assert_close(rows, numeric[1, :, axis], atol=1e-6, rtol=0)
         torch.testing.assert_close(shape.sum(1), by_shape[1, ids, axis], atol=1e-8, rtol=0)
 
@@ -108,10 +108,10 @@ def test_fingers_that_are_bent_stay_so_while_the_body_moves() -> None:
     pose = random_pose(rig, 2)
     pose.theta[:, [j for j, name in enumerate(rig.joint_names) if name.startswith("finger")]] = 0.3
     articulation = Articulation(rig)
-    joints = articulation.pose(pose)
-    torch.testing.assert_close(articulation.surface(joints, 1), pose_vertices(rig, pose.theta, pose.root)[1])
-    ids = joints.bent[::97]
+    skin = articulation.skin(pose)
+    torch.testing.assert_close(articulation.surface(skin, 1), pose_vertices(rig, pose.theta, pose.root)[1])
+    ids = skin.bent[::97]
     direction = torch.randn(len(ids), 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    by_frame, _ = articulation.directional_jacobian(ids, direction, joints, 1)
+    by_frame, _ = articulation.directional_jacobian(ids, direction, skin, 1)
     numeric = torch.einsum("pcu,pc->pu", numeric_jacobian(pose, ids)[1], direction)
     torch.testing.assert_close(by_frame, numeric, atol=1e-7, rtol=0)

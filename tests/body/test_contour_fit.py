@@ -166,7 +166,7 @@ def test_residuals_enter_the_normal_equations_twice_if_added_twice() -> None:
     rows = ContourResiduals(np.array([1, 3]), random.normal(size=(2, 3)), np.array([0.1, -0.2]), np.array([4.0, 9]))
     equations = NormalEquations(2, articulation.unknowns, 3)
     for _ in range(2):
-        add_residuals(equations, articulation, articulation.pose(pose), frame, rows)
+        add_residuals(equations, articulation, articulation.skin(pose), frame, rows)
     by_pose, by_shape = random.normal(size=articulation.unknowns), 0.7
     ends_m = []
     for sign in (1, -1):
@@ -174,7 +174,7 @@ def test_residuals_enter_the_normal_equations_twice_if_added_twice() -> None:
         steps[frame] = sign * step * by_pose
         moved = articulation.apply_step(pose, torch.from_numpy(steps))
         moved = dataclasses.replace(moved, rig=rig.reshaped(rig.beta + sign * step * by_shape))
-        ends_m.append(Articulation(moved.rig).surface(Articulation(moved.rig).pose(moved), frame).numpy())
+        ends_m.append(Articulation(moved.rig).surface(Articulation(moved.rig).skin(moved), frame).numpy())
     along = (rows.gradient * (ends_m[0] - ends_m[1])[rows.vertices] / (2 * step)).sum(1)
     shared = np.array([by_shape, 0, 0])
     slope = equations.frame_gradient[frame] @ by_pose + equations.shared_gradient @ shared
