@@ -43,6 +43,7 @@ BETA_NAMES = PHENOTYPES + LOCAL_CHANGES
 ADULT = (0.5, 0.72, 0.5, 0.5, 0.5, 0.5) + (0.0,) * len(LOCAL_CHANGES)  # at age 0.5 anny is a teenager of 1.63 m
 BETA_LOW = (0.0,) * len(PHENOTYPES) + (-1.0,) * len(LOCAL_CHANGES)
 BETA_HIGH = (1.0,) * len(BETA_NAMES)
+STEP = 1e-6  # of a phenotype, for its derivative
 
 # Limbs, spine, neck and head turn; fingers, toes, eyes and the twist halves of a limb follow their parents.
 FREE_JOINTS = (
@@ -80,9 +81,7 @@ def anny_rig(beta: Tensor | None = None) -> Rig:
     beta = torch.tensor(ADULT) if beta is None else beta
     beta = beta.detach().to(torch.float64).clamp(torch.tensor(BETA_LOW), torch.tensor(BETA_HIGH))
     average = _average()
-    jacobian = torch.autograd.functional.jacobian(_coefficients, beta, vectorize=True, strategy="forward-mode")
-    rows = torch.cat([_coefficients(beta)[None], jacobian.T]).float()  # (1 + 28, rows)
-    moved = rows @ _shapes()
+    moved = _coefficients(beta).float() @ _shapes()
     vertices, joints = moved.unflatten(-1, (-1, 3)).split([len(average.vertices_m), len(average.joints_m)], 1)
     return dataclasses.replace(
         average,
@@ -133,11 +132,21 @@ def _shapes() -> Tensor:
 
 
 def _coefficients(beta: Tensor) -> Tensor:
-    """Return coefficients (rows,) of `_shapes` at shape values (28,); piecewise multilinear in the phenotypes."""
+    """Return coefficients of `_shapes` at shape values (28,), then their derivatives by each of these, (1 + 28, rows).
+
+    They are linear in each phenotype between anchors, so that differences are derivatives: at an anchor, from below,
+    but at 0 from above.
+    """
     phenotypes, local = beta.split([len(PHENOTYPES), len(LOCAL_CHANGES)])
-    unchanged = beta.new_zeros(1, len(anny_model().local_change_labels))
-    rows = anny_model()._get_phenotype_blendshape_coefficients(phenotypes[None], unchanged, beta.new_zeros(1, 0))[0]
-    return torch.cat([rows[: -2 * unchanged.shape[1]], local])
+    step = torch.where(phenotypes > STEP, -STEP, STEP)
+    around = torch.cat([phenotypes[None], phenotypes + step.diag()])
+    unchanged = beta.new_zeros(len(around), len(anny_model().local_change_labels))
+    rows = anny_model()._get_phenotype_blendshape_coefficients(around, unchanged, beta.new_zeros(len(around), 0))
+    by_phenotype = rows[:, : -2 * unchanged.shape[1]]
+    by_phenotype[1:] = (by_phenotype[1:] - by_phenotype[0]) / step[:, None]
+    found = torch.block_diag(by_phenotype, torch.eye(len(local), dtype=local.dtype))
+    found[0, by_phenotype.shape[1] :] = local
+    return found
 
 
 def _keypoint_weights(model: "anny.Anny") -> Tensor:

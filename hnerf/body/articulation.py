@@ -92,7 +92,7 @@ class Articulation:
         rows, weights = self.rig.keypoint_weights[:, used], self.vertex_weights[used]
         carried = (rows != 0).float() @ (weights != 0).float() > 0  # (25, M), few of them
         keypoint, joint = carried.nonzero(as_tuple=True)
-        split = rows[keypoint] * weights.T[joint]  # (carried, V used)
+        split = rows[keypoint] * weights.T.contiguous()[joint]  # (carried, V used)
         columns = torch.cat([self.rig.vertices_m[None, used], self.rig.shape_basis[:, used]]).transpose(0, 1).flatten(1)
         sums = torch.zeros(*carried.shape, columns.shape[1], dtype=rows.dtype)
         sums[carried] = split @ columns

@@ -1,6 +1,7 @@
+import pytest
 import torch
 
-from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
+from hnerf.body.anny import ADULT, BETA_NAMES, _coefficients, anny_rig
 from hnerf.body.rig import pose_vertices
 
 
@@ -35,6 +36,15 @@ def test_the_shape_basis_is_the_derivative_of_the_rig() -> None:
         above, below = anny_rig(beta + step), anny_rig(beta - step)
         torch.testing.assert_close((above.vertices_m - below.vertices_m) / 0.02, rig.shape_basis[k], atol=2e-3, rtol=0)
         torch.testing.assert_close((above.joints_m - below.joints_m) / 0.02, rig.joint_basis[k], atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("phenotypes", [0.0, 0.37, 0.5, 1.0])
+def test_derivatives_of_coefficients_are_those_of_autograd(phenotypes: float) -> None:
+    """At 0 and 1, the ends of the range, and at 0.5, an anchor of most phenotypes, too. Ages below 0 are not ours."""
+    beta = torch.tensor([phenotypes] * 6 + [0.1] * 22, dtype=torch.float64)
+    beta[1] = max(phenotypes, 0.1)
+    exact = torch.autograd.functional.jacobian(lambda values: _coefficients(values)[0], beta)
+    torch.testing.assert_close(_coefficients(beta)[1:], exact.T, atol=1e-9, rtol=0)
 
 
 def test_local_changes_are_linear_with_no_kink_at_zero() -> None:
