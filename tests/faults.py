@@ -119,7 +119,7 @@ FAULTS = (
     Fault("floor-sideways", "training/step", "[..., self.ground_axis])", "[..., 0])"),
     Fault("increment-forgets", "body/canonical", "self.move_m + self.absorbed_move_m", "self.move_m",
           "training/losses"),
-    Fault("sole-ignored", "body/contour_fit", "(vertices_m, ground, sole_m)]", "(vertices_m, ground, 0.0)]", "body/fit"),
+    Fault("sole-ignored", "body/contour_fit", "vertices_m, ground, sole_m)]", "vertices_m, ground, 0.0)]", "body/fit"),
     Fault("fit-clothed", "training/step", "segmentation(samples.d, target", "segmentation(samples.d_hat, target"),
     Fault("segmentation-naked", "training/step", "segmentation(samples.d_hat, target",
           "segmentation(samples.d, target"),
