@@ -9,7 +9,7 @@ from hnerf.errors import InputError
 from tests import fuzz as module
 from tests.fuzz import READERS, Reader, Workshop, fuzz
 
-SECONDS = 15.0
+SECONDS = 8.0
 
 
 def test_damaged_files_are_read_or_refused() -> None:
