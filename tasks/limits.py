@@ -48,9 +48,10 @@ def limited(stage: str, images: int, resumable: bool) -> Iterator[None]:
     it, end this process. Outside the main thread, where nothing can be raised, only the latter."""
     patience_s, last = limit_s(images), Progress("", 0, 0)
     armed_s = time.monotonic()
+    main = threading.current_thread() is threading.main_thread()
 
     def arm() -> None:
-        if threading.current_thread() is threading.main_thread():
+        if main:  # whichever thread reports
             signal.setitimer(signal.ITIMER_REAL, patience_s)
         faulthandler.dump_traceback_later(patience_s + GRACE_S, exit=True, file=sys.__stderr__ or 2)
 
@@ -71,7 +72,6 @@ def limited(stage: str, images: int, resumable: bool) -> Iterator[None]:
             resumable,
         )
 
-    main = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGALRM, end) if main else None
     try:
         with listening(rearm):

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,22 @@ def test_a_stage_without_progress_is_ended_and_its_cause_said(resumable: bool) -
 def test_progress_gives_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "REARM_S", 0.0)
     within(0.3, lambda: sleep_in(False, with_progress_every_s=0.1, duration_s=0.6))
+
+
+def test_progress_in_another_thread_gives_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A download from a bucket reports from the thread of its event loop."""
+    monkeypatch.setattr(limits, "REARM_S", 0.0)
+
+    def download() -> None:
+        for done in range(16):
+            report("a.mp4", done, 16)
+            time.sleep(0.05)
+
+    def wait_for_download() -> None:
+        with limited("fetched", 1, resumable=False), ThreadPoolExecutor(1) as pool:
+            pool.submit(download).result()
+
+    within(0.5, wait_for_download)
 
 
 def test_the_same_progress_again_gives_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
