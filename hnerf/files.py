@@ -1,4 +1,4 @@
-"""Folders and text files that are written completely or not at all, and Markdown with embedded images."""
+"""Folders and files that are written completely or not at all, and Markdown with embedded images."""
 
 import base64
 import os
@@ -40,16 +40,27 @@ def made_folder(folder: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def replace_text(path: Path, text: str) -> None:
-    """Replace a text file atomically: write a temporary file beside it, then rename."""
-    encoded = text.encode()
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield the path of a file to write beside `path`; on success it replaces that, on failure it is deleted. Errors
+    name `path`."""
     beside = path.with_name(f".{uuid4().hex}")
     try:
-        with beside.open("xb") as file:  # never through a link that lies there
-            file.write(encoded)
+        yield beside
         os.replace(beside, path)
+    except OSError as error:
+        if str(error.filename) != str(beside):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
         beside.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Replace a text file atomically."""
+    encoded = text.encode()
+    with atomic_file(path) as beside, beside.open("xb") as file:  # never through a link that lies there
+        file.write(encoded)
 
 
 def markdown_image(name: str) -> str:

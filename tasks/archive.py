@@ -1,6 +1,5 @@
 """A subject as one file: the artifacts of its latest results, packed (tasks/packed.py), and its links."""
 
-import os
 from pathlib import Path
 from typing import Annotated
 from uuid import uuid4
@@ -9,6 +8,7 @@ from pydantic import Field, model_validator
 
 from hnerf.config import validated
 from hnerf.errors import InputError
+from hnerf.files import atomic_file
 from tasks.inventory import Inventory
 from tasks.packed import Contents, Name, archived, pack, place, read_contents, require_room, unpack
 from tasks.store import STAGES, Artifact, Store
@@ -44,12 +44,8 @@ def export_subject(store: Store, subject: str, out: Path) -> Manifest:
     artifacts = [_intact(store, *name.split("/")) for name in sorted(inventory.with_inputs(latest.values()))]
     described = {"subject": subject, "recording": store.recording(subject), "latest": latest}
     manifest = validated(Manifest, {**described, "artifacts": archived(artifacts)}, store.subject_folder(subject))
-    beside = out.with_name(f".{uuid4().hex}")
-    try:
+    with atomic_file(out) as beside:
         pack(manifest, store, beside)
-        os.replace(beside, out)
-    finally:
-        beside.unlink(missing_ok=True)
     return manifest
 
 

@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
-from uuid import uuid4
 
 from fsspec import AbstractFileSystem
 from fsspec.callbacks import Callback
@@ -17,6 +16,7 @@ from fsspec.core import url_to_fs
 from fsspec.implementations.local import LocalFileSystem
 
 from hnerf.errors import InputError, PlaceError, one_line
+from hnerf.files import atomic_file
 from hnerf.progress import report
 
 VARIABLE = "HNERF_BUCKET"
@@ -127,11 +127,12 @@ class Bucket:
     def upload(self, path: Path, name: str) -> None:
         """Make or replace an object with a file's bytes."""
         with self._answering(name, written=True):
+            if not self.is_disk:
+                self.fs.put_file(str(path), self._path(name))
+                return
             self._make_folder(name)
-            beside = f"{name}.{uuid4().hex}" if self.is_disk else name
-            self.fs.put_file(str(path), self._path(beside))
-            if self.is_disk:
-                os.replace(self._path(beside), self._path(name))
+            with atomic_file(Path(self._path(name))) as beside:
+                self.fs.put_file(str(path), str(beside))
 
     def create_note(self, name: str, text: bytes) -> bool:
         """Make a small object; return False if it is there already, which the file system decides for all machines."""

@@ -30,12 +30,11 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Annotated
-from uuid import uuid4
 
 from pydantic import BaseModel, Field, FiniteFloat
 
 from hnerf.errors import InputError
-from hnerf.files import made_folder, replace_text
+from hnerf.files import atomic_file, made_folder, replace_text
 from tasks.pins import pin, unless_read_only
 
 log = logging.getLogger("hnerf.store")
@@ -183,9 +182,8 @@ class Store:
         if link.is_symlink():  # what was computed from an earlier artifact no longer belongs to the subject
             for stage in STAGES[STAGES.index(artifact.stage) + 1 :]:
                 (link.parent / stage).unlink(missing_ok=True)
-        beside = link.with_name(f".{uuid4().hex}")
-        beside.symlink_to(target)
-        os.replace(beside, link)
+        with atomic_file(link) as beside:
+            beside.symlink_to(target)
         return artifact
 
     def unlink_latest(self, subject: str, stages: Iterable[str]) -> None:

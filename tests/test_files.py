@@ -5,7 +5,7 @@ from unittest.mock import Mock
 import pytest
 
 from hnerf.errors import InputError
-from hnerf.files import atomic_folder, made_folder, replace_text
+from hnerf.files import atomic_file, atomic_folder, made_folder, replace_text
 
 
 def test_it_takes_its_name_when_all_is_written(tmp_path: Path) -> None:
@@ -65,3 +65,12 @@ def test_a_text_that_cannot_be_replaced_leaves_nothing(tmp_path: Path, monkeypat
     with pytest.raises(OSError, match="full"):
         replace_text(tmp_path / "note", "mine")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("missing", ["folder", "file"])
+def test_an_error_names_the_file_and_not_the_one_beside_it(tmp_path: Path, missing: str) -> None:
+    path = tmp_path / "no" / "ada.tar" if missing == "folder" else tmp_path / "ada.tar"
+    with pytest.raises(FileNotFoundError) as caught, atomic_file(path) as beside:
+        if missing == "folder":
+            beside.touch()
+    assert str(caught.value) == f"[Errno 2] No such file or directory: '{path}'"
