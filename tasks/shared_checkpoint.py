@@ -14,7 +14,7 @@ from threading import Event, Thread
 
 from hnerf.errors import InputError
 from hnerf.files import replace_text
-from tasks.bucket import Bucket, BucketError
+from tasks.bucket import Bucket
 from tasks.packed import require_room
 from tasks.store import Store, remove, sha256_of
 
@@ -106,10 +106,10 @@ def _version(path: Path) -> Version:
 
 
 def _attempt(act: Callable[[], None]) -> bool:
-    """Return whether the bucket let it be done; warn if not: the work goes on without."""
+    """Return whether bucket and disk let it be done; warn if not: the work goes on without."""
     try:
         act()
-    except (BucketError, InputError) as error:
+    except (OSError, InputError) as error:
         log.warning("%s", error)
         return False
     return True

@@ -1,3 +1,4 @@
+import errno
 import multiprocessing
 import os
 import random
@@ -13,6 +14,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from hnerf.errors import InputError
+from hnerf.files import replace_text
 from tasks import lease, packed, shared_checkpoint
 from tasks.bucket import Bucket, BucketError
 from tasks.garbage import find_garbage
@@ -318,6 +320,24 @@ def test_work_goes_on_where_the_bucket_takes_no_checkpoint(
     monkeypatch.setattr(Bucket, "upload", slow)
     resumed(bucket, Store(tmp_path / "here"), work)
     resumed(bucket, Store(tmp_path / "there"), never)
+
+
+def test_checkpoints_are_shared_again_once_this_disk_has_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full, store = [OSError(errno.ENOSPC, "No space left on device")], Store(tmp_path / "here")
+
+    def note(path: Path, text: str) -> None:
+        if full:
+            raise full.pop()
+        replace_text(path, text)
+
+    def work(out: Path) -> dict[str, float]:
+        (out / "checkpoint").write_text("step 100")
+        soon(store.path("training", KEY, ".shared").exists)
+        return finish(out)
+
+    monkeypatch.setattr(shared_checkpoint, "LOOK_S", 0.01)
+    monkeypatch.setattr(shared_checkpoint, "replace_text", note)
+    resumed(disk_bucket(tmp_path), store, work)
 
 
 def test_a_fetched_checkpoint_does_not_follow_links(tmp_path: Path) -> None:
