@@ -1,5 +1,6 @@
 """Launcher of a module in several processes under torchrun, none of which outlives the caller."""
 
+import errno
 import fcntl
 import json
 import logging
@@ -125,7 +126,9 @@ def _error(module: str, logs: Path, ended: int) -> Exception:
         return LostWorkerError(f"{module}: torchrun was killed by {signal.Signals(-ended).name}")
     if not (logs / FAILURE).exists():
         return RuntimeError(f"{module}: torchrun did not start")
-    rank, code = json.loads((logs / FAILURE).read_text())
+    if not (report := (logs / FAILURE).read_text()):
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(logs / FAILURE))
+    rank, code = json.loads(report)
     written = [path.read_text(errors="replace") for path in logs.glob(f"*/attempt_0/{rank}/stderr.log")]
     lines = "".join(written).strip().splitlines()[-LAST_LINES:]
     if code in ERROR_BY_EXIT_CODE and lines:

@@ -37,15 +37,18 @@ def training_key(capture: Capture, masks: Masks, body: BodyFit, settings: Traini
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
     """Replace the checkpoint in `folder` atomically. state: tensors, numbers, strings and containers of them."""
-    beside = folder / f"{NAME}.tmp"  # the next write overwrites what an interrupted one leaves
-    with beside.open("wb") as file:
-        try:
-            torch.save(state, file)
-        except RuntimeError as error:  # raised by torch on closing an incomplete file, in place of the OSError
-            raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(beside, folder / NAME)
+    beside = folder / f"{NAME}.tmp"  # the next write overwrites what a killed one leaves
+    try:
+        with beside.open("wb") as file:
+            try:
+                torch.save(state, file)
+            except RuntimeError as error:  # raised by torch on closing an incomplete file, in place of the OSError
+                raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, folder / NAME)
+    finally:
+        beside.unlink(missing_ok=True)  # of a full disk: what says why needs room, too
 
 
 def load_checkpoint(folder: Path, device: torch.device, key: str) -> dict[str, Any] | None:

@@ -16,6 +16,7 @@ import pytest
 from hnerf.errors import InputError
 from tasks import launcher
 from tasks.launcher import LostWorkerError, RankFailedError, run_ranks
+from tasks.policy import is_retryable
 
 RANKS = "tests.tasks.ranks"
 PATIENCE_S = 60.0
@@ -115,6 +116,12 @@ def test_the_first_failure_of_torchrun_by_exit_code(
     written.write_text(f"a warning\n{last_line}\n")
     found = launcher._error("ranks", tmp_path, 1)
     assert type(found) is error and re.search(message, str(found))
+
+
+def test_a_report_that_had_no_room_is_a_full_disk(tmp_path: Path) -> None:
+    (tmp_path / launcher.FAILURE).touch()
+    found = launcher._error("ranks", tmp_path, 1)
+    assert is_retryable(found) and str(found) == f"[Errno 28] No space left on device: '{tmp_path}/{launcher.FAILURE}'"
 
 
 def start_caller(folder: Path) -> "subprocess.Popen[bytes]":

@@ -376,7 +376,7 @@ def test_other_settings_and_poses_are_another_training(tmp_path: Path) -> None:
     assert len(keys) == 3 and training_key(capture, masks, body, same) in keys
 
 
-def test_a_full_disk_is_an_os_error(tmp_path: Path):
+def test_a_full_disk_is_an_os_error_and_what_filled_it_goes(tmp_path: Path):
     """torch reports the second one as a RuntimeError."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, limits[1]))
@@ -385,6 +385,7 @@ def test_a_full_disk_is_an_os_error(tmp_path: Path):
             save_checkpoint(tmp_path, {"x": torch.ones(1 << 16)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_two_halves_side_by_side_have_the_gradients_of_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
