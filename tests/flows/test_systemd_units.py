@@ -29,6 +29,11 @@ def test_both_come_back_whatever_ends_them() -> None:
     assert "Wants=hnerf-server.service" in units(Path("/srv/hnerf"))["hnerf-worker.service"]
 
 
+def test_the_worker_opens_no_port() -> None:
+    """The health check of Prefect's worker listens on port 8080 of every address."""
+    assert "--with-healthcheck" not in units(Path("/srv/hnerf"))["hnerf-worker.service"]
+
+
 @pytest.mark.parametrize("name", ['a"b', "a\\b"])
 def test_a_path_that_systemd_does_not_take_is_one_line(
     tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
