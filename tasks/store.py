@@ -163,7 +163,7 @@ class Store:
                 metrics = write(partial)
             except BaseException as error:
                 if not resumable or isinstance(error, InputError):
-                    shutil.rmtree(partial)
+                    remove(partial)
                 raise
             finite = {name: value for name, value in metrics.items() if math.isfinite(value)}  # JSON has no others
             made = Artifact(stage=stage, root=self.path(stage, key), files={}, metrics=finite,

@@ -67,6 +67,17 @@ def test_half_written_artifact_is_not_seen(tmp_path: Path, error: BaseException)
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_store_that_vanishes_is_not_taken_for_a_file_that_is_missing(tmp_path: Path) -> None:
+    """The fault itself is tried again; that nothing is left to be removed hides none."""
+
+    def lose(out: Path) -> dict[str, float]:
+        shutil.rmtree(tmp_path / "share")
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    with pytest.raises(OSError, match="Stale file handle"):
+        Store(tmp_path / "share").get_or_compute("fit", "k", lose)
+
+
 def test_failures_at_once_keep_apart_and_leave_no_lock(tmp_path: Path) -> None:
     """Each removes the lock that others wait for, and the folder in which they are about to make theirs."""
     alone = threading.Lock()
