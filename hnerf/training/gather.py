@@ -54,15 +54,17 @@ def gather_pixels(
     page them out. The files are unlinked by the time this returns: their space is freed when the last process ends,
     however it ends.
     """
-    if processes.is_main:
-        folder.mkdir(parents=True, exist_ok=True)
-        _remove(folder)  # what a killed process left
-        _write_pixels(capture, masks, body, frames, visible_pixels, gains, folder)
-    processes.barrier()
-    columns: dict[str, Any] = {name: _mapped(folder / f"{name}{SUFFIX}", *kind) for name, kind in COLUMNS.items()}
-    processes.barrier()
-    if processes.is_main:
-        _remove(folder)
+    try:
+        if processes.is_main:
+            folder.mkdir(parents=True, exist_ok=True)
+            _remove(folder)  # what a killed process left
+            _write_pixels(capture, masks, body, frames, visible_pixels, gains, folder)
+        processes.barrier()
+        columns: dict[str, Any] = {name: _mapped(folder / f"{name}{SUFFIX}", *kind) for name, kind in COLUMNS.items()}
+        processes.barrier()
+    finally:
+        if processes.is_main:
+            _remove(folder)
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     return Pixels(
         widths_px=torch.tensor([c.width_px for c in cameras]),

@@ -1,8 +1,10 @@
 """Which pixels a step draws, and where a recording's edges are."""
 
 import dataclasses
+import errno
 import functools
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -89,6 +91,15 @@ def test_pixels_show_what_the_images_do(tmp_path: Path, visible_pixels: Reachabl
             assert np.array_equal(pixels.colour[part].numpy(), capture.image(name, frame)[y, x])
             assert np.array_equal(pixels.person[part].numpy(), masks.get(name, frame)[y, x])
             assert pixels.edge[part].any()
+
+
+def test_pixels_that_have_no_room_leave_it_to_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(gather, "_exposure_corrected", Mock(side_effect=full))
+    capture, masks, body = record(tmp_path)
+    with pytest.raises(OSError, match="No space left"):
+        gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path / "out", ALONE)
+    assert not any((tmp_path / "out").iterdir())
 
 
 def test_an_outline_before_an_unknown_background_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
