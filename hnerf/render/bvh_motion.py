@@ -11,7 +11,7 @@ from hnerf.body.body_model import body_model
 from hnerf.body.bvh import Bvh, read_bvh
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
-from hnerf.body.skeletons import EQUIVALENTS, PELVIS, SKELETONS, exported_from, exported_name
+from hnerf.body.skeletons import EQUIVALENTS, FINGERS, PELVIS, SKELETONS, exported_from, exported_name, is_serial
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
@@ -19,6 +19,7 @@ from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 LIMBS = ("thigh", "calf", "foot", "upperarm", "forearm", "hand")
 NEEDED = (PELVIS, *(f"{limb}_{side}" for side in "LR" for limb in LIMBS))
 ENDS = {"upperarm": "forearm", "forearm": "hand", "thigh": "calf", "calf": "foot"}  # of limbs whose rest poses differ
+AT_REST = {name for name in EQUIVALENTS if is_serial(name) or name.startswith(FINGERS)}  # whatever a file says of them
 PREFIX = re.compile(r".*:|mixamorig\d*_?")
 
 
@@ -67,12 +68,13 @@ def retargeted(path: Path, file: Bvh, rig: Rig) -> BodyFit:
 
 
 def joints_by_name(path: Path, names: tuple[str, ...]) -> dict[str, int]:
-    """Return which of a file's joints each exported name is, in the skeleton that most of its names are of. Raises
-    InputError if hips, arms or legs are not among them."""
+    """Return which of a file's joints each exported name is, in the skeleton that most of its names are of, without
+    those of joints that stay at rest: CMU's trunk is not HumanIK's, but its fingers are. Raises InputError if hips,
+    arms or legs are not among them."""
     plain = {PREFIX.sub("", name).lower(): j for j, name in reversed(list(enumerate(names)))}
     tables = [{name: name for name in EQUIVALENTS}, *map(exported_from, SKELETONS)]
     found = [{ours: plain[t.lower()] for t, ours in table.items() if t.lower() in plain} for table in tables]
-    best = max(found, key=lambda joints: (sum(name in joints for name in NEEDED), len(joints)))
+    best = max(found, key=lambda joints: (sum(name in joints for name in NEEDED), len(joints.keys() - AT_REST)))
     missing = [name for name in NEEDED if name not in best]
     if missing:
         raise InputError(

@@ -105,6 +105,16 @@ def test_joints_are_found_by_name(skeleton: str, prefix: str) -> None:
     assert joints_by_name(Path("a.bvh"), file.names) == {name: j for j, name in enumerate(T_POSE)}
 
 
+def test_a_file_of_cmus_database_is_not_taken_for_another_skeletons() -> None:
+    """Its fingers and both its necks have names of HumanIK's, but LowerBack, Spine and Spine1 are the trunk."""
+    sided = ("UpLeg", "Leg", "Foot", "ToeBase", "Shoulder", "Arm", "ForeArm", "Hand", "FingerBase", "HandIndex1")
+    trunk = ("Hips", "LHipJoint", "RHipJoint", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head", "LThumb")
+    names = (*trunk, *(side + name for side in ("Left", "Right") for name in sided))
+    found = {ours: names[j] for ours, j in joints_by_name(Path("a.bvh"), names).items()}
+    assert [found[f"spine_0{k}"] for k in (1, 3, 5)] == ["LowerBack", "Spine", "Spine1"]
+    assert (found["neck_01"], found["head"], found["middle_toe_01_L"]) == ("Neck1", "Head", "LeftToeBase")
+
+
 def test_a_file_without_arms_is_refused() -> None:
     with pytest.raises(
         InputError, match=r"a\.bvh: no joint for upperarm_L, forearm_L, hand_L; name them as one of ue5"
