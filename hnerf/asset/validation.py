@@ -42,11 +42,12 @@ def validate_package(path: Path) -> dict[str, Any]:
 def each_variant(stage: Usd.Stage) -> Iterator[str]:
     """Select combinations of the root prim's variants in turn, in the session layer, and yield what a message says of
     each: nothing without variants, else like "rig=full motion=captured: ". They are all those that have at least two of
-    the first motion, the first shape and the first level of detail, in each topology."""
+    the motion, the shape and the level of detail that the file itself selects, in each topology."""
     stage.SetEditTarget(stage.GetSessionLayer())
     root = stage.GetDefaultPrim()
     topologies = root.GetVariantSet("topology").GetVariantNames() if root else []
     for topology in topologies or [""]:
+        stage.GetSessionLayer().Clear()
         yield from _each_inside(root, topology)
 
 
@@ -55,9 +56,10 @@ def _each_inside(root: Usd.Prim, topology: str) -> Iterator[str]:
     if topology:
         root.GetVariantSet("topology").SetVariantSelection(topology)
     sets = {} if not root else {name: root.GetVariantSet(name) for name in root.GetVariantSets().GetNames()}
+    default = {name: v.GetVariantSelection() for name, v in sets.items()}
     names = {name: [topology] if name == "topology" else v.GetVariantNames() for name, v in sets.items()}
     for chosen in itertools.product(*names.values()):
-        further = {name for name, value in zip(names, chosen, strict=True) if value != names[name][0]}
+        further = {name for name, value in zip(names, chosen, strict=True) if value != default[name]}
         if len(further & {"lod", "motion", "shape"}) > 1:
             continue
         for variants, name in zip(sets.values(), chosen, strict=True):

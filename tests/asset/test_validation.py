@@ -8,7 +8,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.package import AssetInfo, write_package, write_usdz
 from hnerf.asset.staging import StagedAvatar
-from hnerf.asset.validation import data_defects, validate_package
+from hnerf.asset.validation import data_defects, each_variant, validate_package
 from hnerf.errors import InvalidAsset
 from tests.asset.figure import side_camera
 
@@ -293,6 +293,21 @@ def test_a_motion_at_another_rate_is_at_its_whole_frames(stage: Usd.Stage) -> No
     stage.SetTimeCodesPerSecond(12.5)
     stage.SetFramesPerSecond(12.5)
     assert "Motion/full: is not sampled at every frame of 24 a second" in "; ".join(data_defects(stage))
+
+
+def test_other_shapes_are_checked_in_the_motion_that_the_file_selects() -> None:
+    """USD sorts names: a motion of Ben's comes before the captured one. Of two by two combinations, that of his motion
+    and the stout shape differs twice."""
+    stage = Usd.Stage.CreateInMemory()
+    stage.SetDefaultPrim(stage.DefinePrim("/Avatar"))
+    for name, variants in {"shape": ("captured", "stout"), "motion": ("captured", "ben")}.items():
+        added = stage.GetDefaultPrim().GetVariantSets().AddVariantSet(name)
+        for variant in variants:
+            added.AddVariant(variant)
+        added.SetVariantSelection("captured")
+    assert list(each_variant(stage)) == [
+        "shape=captured motion=ben: ", "shape=captured motion=captured: ", "shape=stout motion=captured: ",
+    ]  # fmt: skip
 
 
 def test_what_we_write_passes_every_validator(package: Path) -> None:
