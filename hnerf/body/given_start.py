@@ -1,5 +1,6 @@
 """Poses that come with a recording, as the start of a fit, and as keypoints where the recording has none."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +28,7 @@ def initial_pose_from_given(given: GivenPoses, model: BodyModel) -> Pose:
     Frames without a pose take that of their nearest neighbour.
     """
     known = given.known.nonzero()[0]
-    nearest = torch.tensor([min(known, key=lambda other: abs(int(other) - t)) for t in range(len(given.theta))])
+    nearest = torch.from_numpy(known[[np.abs(known - t).argmin() for t in range(len(given.theta))]])
     rig = model.rig(torch.from_numpy(given.betas) if model.is_smpl else None)
     turns = rotation_from_axis_angle(torch.from_numpy(given.theta))[nearest]
     placed = torch.from_numpy(given.root)[nearest]
