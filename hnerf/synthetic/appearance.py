@@ -92,7 +92,7 @@ def room_colour(origin_m: np.ndarray, directions: np.ndarray) -> tuple[np.ndarra
     low = np.array([-ROOM_HALF_SIDE_M, -ROOM_HALF_SIDE_M, 0.0])
     high = np.array([ROOM_HALF_SIDE_M, ROOM_HALF_SIDE_M, ROOM_HEIGHT_M])
     with np.errstate(divide="ignore"):
-        exits = (np.where(directions > 0, high, low) - origin_m) / directions
+        exits = np.abs((np.where(directions > 0, high, low) - origin_m) / directions)  # endless along a wall
     axis = exits.argmin(1)
     hit = origin_m + exits.min(1)[:, None] * directions
     level, colour = axis == 2, np.empty_like(hit)

@@ -18,7 +18,7 @@ from hnerf.config import CaptureSettings, SyntheticSettings
 from hnerf.geometry.rays import cast, mesh_on_cpu
 from hnerf.synthetic import write_synthetic_capture
 from hnerf.synthetic.dressed import DressedBody
-from hnerf.synthetic.render import dome_lights, floor_shadow, irradiance, visibility
+from hnerf.synthetic.render import RoomView, dome_lights, floor_shadow, irradiance, visibility
 from hnerf.synthetic.walk import walk_pose
 from hnerf.synthetic.write import camera_names, ring_of_cameras
 
@@ -64,6 +64,13 @@ def test_the_ring_by_hand() -> None:
     assert camera_names(SyntheticSettings(train_cameras=3, test_cameras=1)) == (["01", "02", "03"], ["04"])
     with pytest.raises(ValidationError, match="one at most between two training cameras"):
         SyntheticSettings(train_cameras=1)
+
+
+def test_a_ray_along_two_walls_meets_the_one_ahead() -> None:
+    """The first camera, at (3, 0, 1.45), looks at (0, 0, 0.92); an odd number of pixels has a middle. From there, the
+    wall at x = -4.2 is 7.2 m ahead, and the ray falls by 0.53 m in 3 m."""
+    middle_m = RoomView.of(ring_of_cameras(SyntheticSettings(size_px=17))[0]).room_m[8, 8]
+    np.testing.assert_allclose(middle_m, [-4.2, 0, 1.45 - 7.2 * 0.53 / 3], atol=1e-9)
 
 
 def test_joints_lie_inside_the_masks(folder: Path, capture: Capture) -> None:
