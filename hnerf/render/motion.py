@@ -99,12 +99,11 @@ def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
     """
     other, names = motion.body, motion.body.rig.joint_names
     theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
-    for j in own.rig.free.nonzero()[:, 0].tolist():
-        if own.rig.joint_names[j] not in names:
-            raise InputError(
-                f"motion: has no joint {own.rig.joint_names[j]}; use one that was fitted with this body model"
-            )
-        theta[:, j] = other.theta[:, names.index(own.rig.joint_names[j])]
+    for j, name in enumerate(own.rig.joint_names):
+        if name in names:  # fingers, too, which are not free, but fitted
+            theta[:, j] = other.theta[:, names.index(name)]
+        elif own.rig.free[j]:
+            raise InputError(f"motion: has no joint {name}; use one that was fitted with this body model")
     turn = torch.eye(4)
     turn[:3, :3] = _rotation_between_up_axes(motion.up, up)
     placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)

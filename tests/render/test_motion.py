@@ -66,6 +66,13 @@ def test_another_motion_stands_where_this_body_stood(up: str) -> None:
     assert found.rig is own.rig
 
 
+def test_joints_that_are_locked_and_posed_as_fingers_are_go_with_the_motion() -> None:
+    own = giant()
+    own.rig.free[1] = False  # the hat's, which turns by 9
+    expected = torch.tensor([[[0.0, 0, 0], [0, 0, 9], [0.1, 0, 0]], [[0, 0, 0], [0, 0, 9], [0.2, 0, 0]]])
+    torch.testing.assert_close(retarget(own, Motion(giant(), 10.0, "z"), "z").theta, expected)
+
+
 @pytest.mark.parametrize("up", ["z", "y"])
 def test_a_trunk_that_pitches_leaves_the_hips_where_they_are(up: str) -> None:
     """The hip is 1.6 m above the origin of the other's body frame, and 0.8 m above that of `own`. As the other lies
