@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from torch import Tensor
 
 from hnerf.asset.export import _clothed_surface, _rest_meshes, export_asset
+from hnerf.asset.pictures import turntable_cameras
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.base_mesh import base_mesh
 from hnerf.body.rig import pose_vertices
@@ -79,6 +80,11 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     )
     monkeypatch.setattr("hnerf.asset.topologies.base_mesh", lambda rig: frowning)
     monkeypatch.setattr("hnerf.asset.extreme_poses.EXPRESSIONS", {"Frown": ("frown",)})
+    shown_from: list[np.ndarray] = []
+    monkeypatch.setattr(
+        "hnerf.asset.report.turntable_cameras",
+        lambda points_m, facing, count: shown_from.append(facing) or turntable_cameras(points_m, facing, count),
+    )
     nod = Motion(select_poses(bending_body(), (4, 5)), 25.0, "z")
     report = export_asset(
         capture(), Masks({}, {}), StandInAvatar(bending_body()), SMALL, tmp_path, "0123", {"nod": nod}
@@ -87,6 +93,8 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert set(report["bytes"]) == FILES
     assert report["viewer"].startswith("no viewer.html: three.js is not installed")
     page = (tmp_path / "report.html").read_text()
+    # In frame 3 the body, which faces -Y, is turned by 2.4 rad about Z: to (sin, -cos, 0), in the stage (sin, 0, cos).
+    np.testing.assert_allclose(shown_from[0], [np.sin(2.4), 0, np.cos(2.4)], atol=1e-6)
     assert report["viewer"] in page and 'href="viewer.html"' not in page
     assert page.count("<img") == 2 + 5 + 2 + 2 + 2  # turntable, surface, an expression, a physique, texture
     assert report["expressions"] == ["frown"] and report["physiques"] == ["stout"]

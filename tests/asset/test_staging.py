@@ -55,6 +55,14 @@ def test_the_soles_are_on_the_ground_and_the_pelvis_above_the_origin() -> None:
     np.testing.assert_allclose(staged.rigs["full"].skeleton.positions_m[:2], 0, atol=1e-6)
 
 
+def test_the_root_stands_where_most_frames_do() -> None:
+    """The lowest points of four frames are at 0.5, 0.5, 0.3 and 0.5 m."""
+    body = bending_body()
+    body.root[2, 2, 3] -= 0.2
+    motion = staged_without_shapes(body).rigs["full"].motions["captured"]
+    np.testing.assert_allclose(motion.translations_m[:, 0, 1], 0.5, atol=1e-6)
+
+
 def test_both_rigs_move_the_surface_as_the_body_does(staged: StagedAvatar) -> None:
     for rig in staged.rigs.values():
         for found_m, true_m in zip(rig.surfaces_m("captured", staged.rest), staged.points_m, strict=True):

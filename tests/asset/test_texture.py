@@ -2,7 +2,7 @@ import numpy as np
 import torch
 import trimesh
 
-from hnerf.asset.texture import Texels, UvLayout, rasterise, unwrap
+from hnerf.asset.texture import Texels, UvLayout, rasterise, texture_image, unwrap
 
 
 def test_texels_of_one_triangle() -> None:
@@ -29,6 +29,16 @@ def test_a_texel_belongs_to_the_face_around_its_centre() -> None:
     inside = texels.column < 3
     at_u = (texels.barycentric * corner_u).sum(1)[inside]
     torch.testing.assert_close(at_u, (texels.column[inside] + 0.5) / 4, atol=1e-5, rtol=0, check_dtype=False)
+
+
+def test_texels_off_the_charts_repeat_the_nearest_border() -> None:
+    """Of 4 x 4, the first in the top row is red and the last in the bottom row blue: those nearer to red, with row and
+    column below 3 in all, and those nearer to blue."""
+    nowhere = torch.zeros(2, dtype=torch.long)
+    ends = torch.tensor([0, 3])
+    image = texture_image(Texels(ends, ends, nowhere, torch.zeros(2, 3)), np.array([[1.0, 0, 0], [0, 0, 0.6]]), 4)
+    row, column = np.indices((4, 4))
+    assert (image[row + column < 3] == (255, 0, 0)).all() and (image[row + column > 3] == (0, 0, 153)).all()
 
 
 def test_values_of_vertices_at_texels() -> None:

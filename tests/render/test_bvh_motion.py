@@ -72,6 +72,7 @@ def test_limbs_point_as_the_files_do(rig: Rig) -> None:
     shin = directions(rig, body, "calf_R", "foot_R")
     np.testing.assert_allclose(shin, [[0, -1, 0]] * 3, atol=1e-5)
     assert body.theta[:, ~rig.free].count_nonzero() == 0
+    assert body.theta[:, rig.joint_names.index("wrist.L")].abs().max() < 1e-5  # hands go on as forearms point
 
 
 def test_lengths_are_scaled_by_the_legs(rig: Rig) -> None:

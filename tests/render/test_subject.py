@@ -90,6 +90,20 @@ def test_a_frame_shown_alone_keeps_its_deformation_and_no_other_pose_has_one(sub
     assert (with_none.alpha - expected["alone/colour/000000.png"].alpha).abs().max() > 0.3
 
 
+def test_every_second_frame_lasts_twice_as_long(subject: Path, tmp_path: Path) -> None:
+    options = ["--camera", "0", "--what", "mask", "--frames", "::2"]
+    assert main(["render", str(subject), "--out", str(tmp_path / "out"), *options]) == 0
+    video = Video.open(tmp_path / "out" / "mask.mp4")
+    assert (len(video.frames), video.fps) == (2, 5.0)  # of 10 a second
+
+
+def test_a_size_is_that_of_the_longer_side(subject: Path) -> None:
+    capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
+    wide = dataclasses.replace(capture, cameras=capture.cameras | {"2": capture.cameras["2"].resized(80, 40)})
+    (found,) = _cameras(RenderOptions(camera="2", size_px=20, pictures=1), wide, body)
+    assert found.size_px == (20, 10)
+
+
 def test_an_orbit_round_one_pose_has_the_size_and_number_asked_for(subject: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ["--frames", "1", "--pictures", "4", "--size", "48", "--what", "mask"]
