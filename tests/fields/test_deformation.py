@@ -41,10 +41,11 @@ def test_all_follow_a_single_node_and_none_where_no_frame_is_meant():
     torch.testing.assert_close(moved, torch.cat([CENTIMETRES, torch.zeros(1, 3)]))
 
 
-def test_shares_by_hand():
+@pytest.mark.parametrize("size_m", [1.0, 2.0])
+def test_shares_by_hand(size_m: float):
     """Nodes at corners 0 and 6, opposite ones. All corners are within 1 of one of them, so nodes reach 0.5: corner 1, 1
-    from node 0 and sqrt(2) from node 6, follows node 0 with 1 / (1 + exp((1 - 2) / 0.25))."""
-    found = FrameDeformation(RIG.vertices_m, RIG.faces, 2, frames=1)
+    from node 0 and sqrt(2) from node 6, follows node 0 with 1 / (1 + exp((1 - 2) / 0.25)), whatever the unit."""
+    found = FrameDeformation(size_m * RIG.vertices_m, RIG.faces, 2, frames=1)
     found.displacement.data[0, 0] = torch.tensor([1.0, 0.0, 0.0])
     moved, normal_displacement = found(at([1, 1, 1], [0.2, 0.3, 0.5]), torch.tensor([0]))
     share = 1 / (1 + torch.exp(torch.tensor(-1 / 0.25)))

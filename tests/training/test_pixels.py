@@ -162,6 +162,12 @@ def test_a_body_beside_the_image_reaches_into_it():
     assert visible_pixels.any(1).nonzero()[0].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 24]
 
 
+@pytest.mark.parametrize("xy_px", [(-32, 20), (30, -32), (92, 20), (30, 72)])
+def test_a_body_far_beside_the_image_does_not_reach_it(xy_px: tuple[int, int]):
+    """Discs of 5 px whose middles are 32 or 33 px outside."""
+    assert not within_reach(AFAR, np.array([[xy_px[0] / 25, xy_px[1] / 25, 200.0]]), 0.2).any()
+
+
 def test_an_arm_towards_the_camera_reaches_as_far_as_it_is_large():
     """20 cm are 10 px at 100 m, although most of the body is at 200 m, where they are 5 px."""
     arm, body = np.tile([[20 / 50, 20 / 50, 100.0]], (3, 1)), np.tile([[50 / 25, 20 / 25, 200.0]], (20, 1))
@@ -181,6 +187,9 @@ def test_what_is_off_the_axis_reaches_farther_away_from_it():
     50)^2) m: those of 44 and 57 at 18 cm, those of 43 and 58 at 21 cm."""
     visible_pixels = within_reach(AHEAD, np.array([[2.0, 0.0, 2.0]]), 0.2)
     assert np.flatnonzero(visible_pixels[0]).tolist() == [*range(44, 58)]
+    from_the_right = dataclasses.replace(AHEAD, K=np.array([[50.0, 0, 60], [0, 50, 0], [0, 0, 1]]))
+    mirrored = within_reach(from_the_right, np.array([[-2.0, 0.0, 2.0]]), 0.2)  # column p is 60 - p
+    assert np.flatnonzero(mirrored[0]).tolist() == [*range(3, 17)]
 
 
 def test_what_is_behind_the_camera_covers_nothing():
@@ -215,5 +224,6 @@ def test_a_body_behind_or_at_the_camera(depths_m: tuple[float, ...]):
     counts."""
     vertices_m = np.array([[0.4 * depth, 0.4 * depth, depth] for depth in depths_m])
     visible_pixels = within_reach(AHEAD, vertices_m, 0.2)
+    assert visible_pixels.shape == (40, 60)
     assert visible_pixels[20, 20] == (depths_m[-1] > 0)
     assert visible_pixels.all() == (0 < depths_m[-1] < 1)
