@@ -47,7 +47,11 @@ class Ground:
         self, equations: NormalEquations, pose: Pose, keypoints_m: Tensor, by_frame: Tensor, by_shared: Tensor
     ) -> float:
         """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), their derivatives by_frame
-        (n, 25, 3, U) and by_shared (n, 25, 3, S)."""
+        (n, 25, 3, U) and by_shared (n, 25, 3, S).
+
+        Heights on the rest body are held in each step, although shape and offsets move them, too: with their
+        derivatives, limbs are farther off (docs/findings.md, body fit).
+        """
         rest_m = (pose.rig.keypoint_weights @ pose.rig.vertices_m)[:, 2] + pose.offsets_m[:, 2]
         up = torch.eye(3, dtype=keypoints_m.dtype)[self.up]
         height_m = keypoints_m @ up - (rest_m - pose.rig.vertices_m[:, 2].min())

@@ -74,7 +74,8 @@ class ShellGrid:
         edges, cumulative, ends = self._march(rays)
         samples = jitter.shape[1]
         strata = torch.arange(samples, device=edges.device, dtype=edges.dtype)
-        wanted = (strata + jitter) / samples * cumulative[:, -1:]
+        share = ((strata + jitter) / samples).clamp(max=1 - 2**-24)  # below 1, which rounding would reach now and then
+        wanted = share * cumulative[:, -1:]
         upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
         inside = wanted - cumulative.gather(1, upper - 1)
         return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0, ends

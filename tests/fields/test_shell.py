@@ -121,6 +121,8 @@ def test_samples_lie_in_the_shell_before_the_solid():
     assert (depths[0].diff() > 0).all()
     assert depths[0, 0].item() == pytest.approx(0.65, abs=0.03)
     assert depths[0, -1].item() == pytest.approx(0.74, abs=0.03)
+    jitter = torch.full((2, 20), 1 - 2**-24)  # the largest below 1: 19 and it are 20 in single precision
+    assert grid.sample_rays(rays, jitter)[0][0, -1].item() == pytest.approx(0.74, abs=0.03)
 
 
 def test_a_gap_between_two_shells_is_not_sampled():
