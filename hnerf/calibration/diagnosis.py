@@ -18,6 +18,8 @@ GROSS_SHARE = 0.05  # of the person's height in the image: beyond this a calibra
 MISFIT_SHARE = 0.8  # a camera is a misfit if the trimmed cost without it falls below this share
 MISFIT_SHARE_OF_THREE = 0.6  # two cameras left agree more easily
 
+MIN_CROSSING_DEG = 10.0  # between lines of sight, below which a point's depth is in doubt
+
 # BODY_25: ankle-knee, knee-hip, hips-neck and neck-nose make 0.87 of an adult's stature (Winter 2009, figure 4.1).
 LIMB_CHAIN = (((11, 10), (14, 13)), ((10, 9), (13, 12)), ((8, 1),), ((1, 0),))
 CHAIN_SHARE_OF_STATURE = 0.87
@@ -74,9 +76,21 @@ def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
         p95_px={name: float(np.percentile(row, 95)) if len(row) else off_px for name, row in found.items()},
         cost_px=trimmed_cost_px(cameras, flat),
         cost_without_px=cost_without_each_px(cameras, flat) if len(cameras) > 2 else {},
-        body_height_m=body_height_m(points_m),
+        body_height_m=body_height_m(crossed_points(cameras, keypoints, points_m)),
         points_m=points_m,
     )
+
+
+def crossed_points(cameras: Sequence[Camera], keypoints: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+    """Return points_m (frames, 25, 3), NaN where the lines of sight to keypoints (C, frames, 25, 3) hardly cross, as
+    between two cameras that face each other.
+
+    The products d d^T of two directions at an angle a add up to a matrix of eigenvalues 1 + |cos a|, 1 - |cos a| and 0.
+    """
+    away_m = np.stack([points_m - camera.centre_m for camera in cameras])
+    directions = np.nan_to_num(away_m / np.linalg.norm(away_m, axis=-1, keepdims=True)) * (keypoints[..., 2:] > 0)
+    across = np.linalg.eigvalsh(np.einsum("cfkd,cfke->fkde", directions, directions))[..., 1]
+    return np.where(across[..., None] >= 1 - np.cos(np.deg2rad(MIN_CROSSING_DEG)), points_m, np.nan)
 
 
 def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:

@@ -4,7 +4,7 @@ import logging
 
 import numpy as np
 
-from hnerf.calibration.diagnosis import GROSS_SHARE
+from hnerf.calibration.diagnosis import GROSS_SHARE, crossed_points
 from hnerf.capture.capture import Capture
 from hnerf.capture.people import person_heights_px
 from hnerf.errors import InputError
@@ -46,7 +46,8 @@ def doubts(capture: Capture, keypoints: np.ndarray, points_m: np.ndarray | None)
     points_m (frames, 25, 3), None with one camera."""
     found = of_other_pictures(capture, keypoints)
     if points_m is not None:
-        found = [*_not_upright(points_m, capture.up), *exchanged_sides(points_m), *found]
+        crossed_m = crossed_points([capture.cameras[name] for name in capture.train_cameras], keypoints, points_m)
+        found = [*_not_upright(crossed_m, capture.up), *exchanged_sides(crossed_m), *found]
         found += of_test_cameras(capture, points_m)
     for line in found:
         log.warning("%s: %s", capture.name, line)

@@ -12,6 +12,7 @@ from hnerf.calibration.diagnosis import (
     MISTAKES,
     body_height_m,
     cost_without_each_px,
+    crossed_points,
     likely_unit,
     size_ratio,
     trimmed_cost_px,
@@ -48,6 +49,31 @@ def true_error_px(camera: Camera, truth: Camera) -> float:
 def test_body_height_by_hand() -> None:
     # The figure's limb chain is .43 + .43 + .50 + |(.05, .194)| = 1.560 m; over 0.87 that is 1.79 m.
     assert body_height_m(STANDING_M[None]) == pytest.approx((0.43 + 0.43 + 0.5 + np.hypot(0.05, 0.194)) / 0.87)
+
+
+def test_two_cameras_that_face_each_other_do_not_tell_how_far_off_what_lies_between_them_is() -> None:
+    """Nose and neck are on the line between them, 4 m from either, and 1 m above it, where their lines of sight cross
+    at 2 atan(1 / 4) = 28 degrees. A third camera, at right angles, sees the neck alone; then both."""
+    cameras = [
+        dataclasses.replace(ring(1)[0], R=np.eye(3), t_m=-np.array(centre_m))
+        for centre_m in ([4.0, 0, 1], [-4.0, 0, 1], [0, 4.0, 1])
+    ]
+    points_m = np.full((1, 25, 3), np.nan)
+    points_m[0, :2] = [0, 0, 1], [0, 0, 2]
+    seen = np.ones((3, 1, 25, 3))
+    seen[2, 0, 0, 2] = 0
+    for count in (2, 3):
+        found = crossed_points(cameras[:count], seen[:count], points_m)
+        assert np.isnan(found[0, 0]).all() and found[0, 1].tolist() == [0, 0, 2]
+    seen[2, 0, 0, 2] = 1
+    assert crossed_points(cameras, seen, points_m)[0, 0].tolist() == [0, 0, 1]
+
+
+def test_facing_cameras_are_not_taken_for_another_unit(tmp_path: Path) -> None:
+    """With errors of 8 px, the person of 1.79 m would be 1.97 m tall if the points between them were believed."""
+    cameras = ring(2)
+    report = check_calibration(write_capture(tmp_path, cameras, detections(cameras, 8)), SETTINGS)
+    assert report.after is not None and report.after.body_height_m == pytest.approx(1.79, abs=0.1)
 
 
 def test_units_by_hand() -> None:
