@@ -44,8 +44,8 @@ def refine_with_clothing(problem: Problem, pose: Pose, edges: list[list[Outline 
         return pose
     cloth_offset_m = np.zeros(len(pose.rig.vertices_m))
     for step in tracked(range(CLOTHED_STEPS), "clothes", CLOTHED_STEPS):
-        pose, cloth_offset_m, left_mm = _clothed_step(problem, pose, edges, cloth_offset_m, threads)
-        log.info("clothes, step %d of %d: %.1f mm rms", step + 1, CLOTHED_STEPS, left_mm)
+        pose, cloth_offset_m, before_mm = _clothed_step(problem, pose, edges, cloth_offset_m, threads)
+        log.info("clothes, step %d of %d: %.1f mm rms", step + 1, CLOTHED_STEPS, before_mm)
     return pose
 
 

@@ -167,8 +167,8 @@ def refine_with_outlines(
     """
     sole_m = 0.0
     for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
-        pose, sole_m, rms_mm = _outline_step(problem, pose, edges, settings, ground, sole_m, threads)
-        log.info("outlines, step %d of %d: %.1f mm rms", step + 1, settings.contour_steps, rms_mm)
+        pose, sole_m, before_mm = _outline_step(problem, pose, edges, settings, ground, sole_m, threads)
+        log.info("outlines, step %d of %d: %.1f mm rms", step + 1, settings.contour_steps, before_mm)
     return pose
 
 

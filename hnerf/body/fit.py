@@ -61,7 +61,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
 
     Raises InputError where keypoints are missing or the person is seen by too few cameras in too many frames.
     """
-    threads = torch.get_num_threads()
+    threads = torch.get_num_threads()  # for frames side by side, each of them in one
     with threadpool_limits(1):  # tensors are so small that threads cost more time than they save
         seconds: dict[str, float] = {}
         if capture.stature_m:

@@ -68,9 +68,9 @@ def retargeted(path: Path, file: Bvh, rig: Rig) -> BodyFit:
 
 
 def joints_by_name(path: Path, names: tuple[str, ...]) -> dict[str, int]:
-    """Return which of a file's joints each exported name is, in the skeleton that most of its names are of, without
-    those of joints that stay at rest: CMU's trunk is not HumanIK's, but its fingers are. Raises InputError if hips,
-    arms or legs are not among them."""
+    """Return which of a file's joints each exported name is, in the skeleton that has most of the file's names. Joints
+    that stay at rest do not count: CMU's fingers are named like HumanIK's, its trunk is not. Raises InputError if hips,
+    arms or legs are missing."""
     plain = {PREFIX.sub("", name).lower(): j for j, name in reversed(list(enumerate(names)))}
     tables = [{name: name for name in EQUIVALENTS}, *map(exported_from, SKELETONS)]
     found = [{ours: plain[t.lower()] for t, ours in table.items() if t.lower() in plain} for table in tables]

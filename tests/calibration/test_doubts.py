@@ -38,6 +38,20 @@ def test_the_face_or_the_feet_are_enough_and_neither_is_no_doubt() -> None:
     assert exchanged_sides(neither) == []
 
 
+def test_what_lies_between_two_cameras_that_face_each_other_tells_no_sides(tmp_path: Path) -> None:
+    """From 50 m on either side, lines of sight cross at less than three degrees; a third camera, at the right angle,
+    tells."""
+    centres_m = ([50.0, 0, 0.9], [-50.0, 0, 0.9], [0, 50.0, 0.9])
+    cameras = [dataclasses.replace(c, t_m=-c.R @ np.array(m)) for c, m in zip(ring(3), centres_m, strict=True)]
+    seen = detections(cameras, 1)
+    capture = write_capture(tmp_path, cameras, seen)
+    keypoints = np.ones((3, FRAMES, 25, 3))
+    (doubt,) = doubts(capture, keypoints, exchanged(walk_m()))
+    assert doubt.startswith("left and right are exchanged")
+    facing = dataclasses.replace(capture, train_cameras=("c0", "c1"))
+    assert doubts(facing, keypoints[:2], exchanged(walk_m())) == ()
+
+
 def with_masks(root: Path) -> tuple[Capture, np.ndarray]:
     """Write a capture whose masks are squares around the keypoints; also return the keypoints (C, frames, 25, 3)."""
     cameras = ring(3)
