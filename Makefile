@@ -20,10 +20,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/hnerf models || echo "warning: no networks; what needs them says so (hnerf models)" >&2
 	touch $@
 
+# Tests start many processes of the same code, which without bytecode would compile it each time.
 test: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check --quiet .
-	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist worksteal
+	env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist worksteal
 
 soak: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m soak

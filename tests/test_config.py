@@ -47,6 +47,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("asset: {grid_cells: 0}", "asset.grid_cells"),
         ("asset: {faces: -1}", "asset.faces"),
         ("asset: {texture_px: -1}", "asset.texture_px"),
+        ("asset: {texture_px: 8193}", "asset.texture_px"),
         ("asset: {texture_poses: 0}", "asset.texture_poses"),
         ("asset: {splats: -1}", "asset.splats"),
         ("training: {field: {kind: nerf}}", "training: nerf does not tune poses"),
