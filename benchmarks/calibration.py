@@ -15,7 +15,9 @@ capture. Needs `../shared` beside this checkout. Writes `benchmarks/results/cali
 import dataclasses
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -114,16 +116,23 @@ def _trials(name: str, trials: int, untouched: int) -> list[dict[str, Any]]:
         whole = ingest(SHARED / "data" / name, CaptureSettings(), Path(folder) / "whole")
         with np.load(SHARED / "data" / name / "ground_truth" / "joints.npz", allow_pickle=False) as stored:
             truth_m = stored["positions"][:, :25].astype(np.float64)
-        outlines, matches = Outlines.of(whole), Matches.of(whole)
-        for seed, (what, fault) in enumerate(schedule):
-            trial = Trial(whole, truth_m, fault, seed, Path(folder) / f"{seed}")
-            with (
-                mock.patch.object(Outlines, "of", lambda capture: outlines),
-                mock.patch.object(Matches, "of", lambda capture: matches),
-            ):
+        with evidence_collected_once(whole):
+            for seed, (what, fault) in enumerate(schedule):
+                trial = Trial(whole, truth_m, fault, seed, Path(folder) / f"{seed}")
                 done.append({"fault": what, "seed": seed, **trial.run()})
-            print(name, done[-1], flush=True)
+                print(name, done[-1], flush=True)
     return done
+
+
+@contextmanager
+def evidence_collected_once(whole: Capture) -> Iterator[None]:
+    """Let every capture meanwhile have the outlines and matches of the whole one."""
+    outlines, matches = cache(partial(Outlines.of, whole)), Matches.of(whole)
+    with (
+        mock.patch.object(Outlines, "of", lambda _, *frames: outlines(*frames)),
+        mock.patch.object(Matches, "of", lambda _: matches),
+    ):
+        yield
 
 
 class Trial:
