@@ -204,9 +204,9 @@ def _check_determined(
 def _motion(points_m: np.ndarray) -> float:
     """Return how far the parts of a person (frames, 25, 3) that move most move from their median place, as a share of
     the stature: the median over frames, for the joint at the 90th percentile."""
-    away = np.linalg.norm(points_m - np.nanmedian(points_m, axis=0), axis=-1)
-    seen = np.isfinite(away).any(0)
-    return float(np.percentile(np.nanmedian(away[:, seen], axis=0), 90)) / body_height_m(points_m)
+    seen_m = points_m[:, np.isfinite(points_m).all(-1).any(0)]
+    away = np.linalg.norm(seen_m - np.nanmedian(seen_m, axis=0), axis=-1)
+    return float(np.percentile(np.nanmedian(away, axis=0), 90)) / body_height_m(points_m)
 
 
 def _uncertainty(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.bundle import align, undistort
-from hnerf.calibration.person.calibrate import _as_recorded, _each_alone, calibrate_from_person
+from hnerf.calibration.person.calibrate import _as_recorded, _each_alone, _motion, calibrate_from_person
 from hnerf.calibration.person.lens import fit_lenses
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import scale_to, stand_on_ground
@@ -198,6 +198,15 @@ def refusal(tmp_path: Path, cameras: list[Camera], seen: dict[str, np.ndarray], 
 
 def test_one_camera_is_refused(tmp_path: Path) -> None:
     assert "one camera" in refusal(tmp_path, ring(1), detections(ring(1), 1.0), [])
+
+
+@pytest.mark.filterwarnings("error")
+def test_joints_that_are_never_seen_do_not_count_as_still() -> None:
+    """Feet, which few detectors find, are never seen. All other joints are 0, 0.3 and 0.6 m along x: 0.3, 0 and 0.3 m
+    from their median place."""
+    points_m = STANDING_M + np.array([0, 0.3, 0.6])[:, None, None] * [1, 0, 0]
+    points_m[:, 19:] = np.nan
+    assert _motion(points_m) == pytest.approx(0.3 / STATURE_M, rel=1e-3)
 
 
 def test_a_person_who_stands_still_is_refused(tmp_path: Path) -> None:
