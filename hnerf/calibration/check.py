@@ -220,7 +220,7 @@ def _change_reasons(old: Camera, new: Camera) -> list[str]:
     turned_deg = np.rad2deg(np.linalg.norm(cv2.Rodrigues(new.R @ old.R.T)[0]))
     moved_cm = 100 * np.linalg.norm(new.centre_m - old.centre_m)
     zoomed = 100 * (new.K[0, 0] / old.K[0, 0] - 1)
-    lens = f", focal length changed by {zoomed:+.1f} %" if new.K[0, 0] != old.K[0, 0] else ""
+    lens = f", focal length changed by {zoomed:+.1f} %" if round(zoomed, 1) else ""
     return [f"turned by {turned_deg:.2f} degrees, moved by {moved_cm:.1f} cm{lens}"]
 
 

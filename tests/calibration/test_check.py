@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.calibration.check import check_calibration
+from hnerf.calibration.bundle import zoomed
+from hnerf.calibration.check import _change_reasons, _rounded, check_calibration
 from hnerf.calibration.diagnosis import (
     MISTAKES,
     body_height_m,
@@ -191,6 +192,14 @@ def test_one_turned_camera_is_named_and_refined(tmp_path: Path) -> None:
     assert stored["verdict"] == "refined"
     assert stored["cameras"]["c2"]["median_px"] < 4 < stored["cameras"]["c2"]["median_before_px"]
     assert cv2.imread(str(tmp_path / "out" / "cameras.png")).shape[2] == 3
+
+
+@pytest.mark.parametrize(("zoom", "lens"), [(1.0, ""), (1.01, ", focal length changed by +1.0 %")])
+def test_a_focal_length_that_only_lost_digits_has_not_changed(zoom: float, lens: str) -> None:
+    """Refined cameras have K to 1e-4 px, and a calibration may have given 1000.00003."""
+    given = dataclasses.replace(ring(1)[0], K=np.array([[1000.00003, 0, 499.5], [0, 1000, 499.5], [0, 0, 1]]))
+    new = _rounded(zoomed(turned(given, 1.0), zoom))
+    assert _change_reasons(given, new) == [f"turned by 1.00 degrees, moved by 0.0 cm{lens}"]
 
 
 def test_far_off_camera_comes_back(tmp_path: Path) -> None:
