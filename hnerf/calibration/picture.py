@@ -31,7 +31,7 @@ def draw_cameras(
     first, second = (axis for axis in range(3) if axis != vertical)
     points_m = np.zeros((0, 25, 3)) if after is None else after.points_m
     for axes, across, along, title in ((above, first, second, "from above"), (side, first, vertical, "from the side")):
-        _draw_scene(axes, cameras, status, points_m[..., [across, along]], (across, along))
+        _draw_scene(axes, cameras, status, points_m, (across, along))
         axes.set(title=title, xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[along]} (m)")
         axes.set_aspect("equal", adjustable="datalim")
     if before is not None and after is not None:
@@ -43,18 +43,19 @@ def draw_cameras(
 
 
 def _draw_scene(
-    axes: Axes, cameras: Sequence[Camera], status: dict[str, str], person: np.ndarray, shown: tuple[int, int]
+    axes: Axes, cameras: Sequence[Camera], status: dict[str, str], points_m: np.ndarray, shown: tuple[int, int]
 ) -> None:
-    """Draw camera frusta and the person's limbs (frames, 25, 2), projected onto one plane of the world."""
-    for pose in person[:: max(1, len(person) // SHOWN_FRAMES)]:
+    """Draw camera frusta and the person's limbs, points (frames, 25, 3), projected onto one plane of the world."""
+    person_m = np.nanmedian(points_m.reshape(-1, 3), axis=0) if len(points_m) else np.zeros(3)
+    for pose_m in points_m[:: max(1, len(points_m) // SHOWN_FRAMES)]:
         for a, b in LIMBS + FEET:
-            axes.plot(*pose[[a, b]].T, color="0.3", linewidth=0.8)
+            axes.plot(*pose_m[[a, b]][:, shown].T, color="0.3", linewidth=0.8)
     for camera in cameras:
         colour = COLOURS[status[camera.name]]
         centre = camera.centre_m
         width, height = camera.width_px - 1, camera.height_px - 1
         corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-        reach_m = FRUSTUM_SHARE * float(np.linalg.norm(camera.t_m))
+        reach_m = FRUSTUM_SHARE * float(np.linalg.norm(person_m - centre))
         ends = centre + reach_m * camera.rays(corners)[1]
         for i in range(4):
             axes.plot(*np.stack([centre, ends[i], ends[i - 1]])[:, shown].T, color=colour, linewidth=1)
