@@ -103,10 +103,11 @@ def test_up_becomes_up() -> None:
     assert torch.equal(_rotation_between_up_axes("y", "y"), torch.eye(3))
 
 
-def test_single_frames_below_the_floor_do_not_lift_a_motion() -> None:
-    """One of four frames of the body has its foot 20 cm below the floor, and one of 21 frames of the motion, 10 cm."""
+def test_single_frames_off_the_floor_do_not_move_a_motion() -> None:
+    """One of four frames of the body has its foot 20 cm below the floor and one 60 cm above; one of 21 frames of the
+    motion, 10 cm below."""
     own, other = bending_body(), giant()
-    own.root[2, 2, 3] -= 0.2
+    own.root[1:3, 2, 3] += torch.tensor([0.6, -0.2])
     root = other.root[:1].repeat(21, 1, 1)
     root[7, 2, 3] -= 0.1
     other = BodyFit(other.rig, tuple(range(21)), other.theta[:1].repeat(21, 1, 1), root)

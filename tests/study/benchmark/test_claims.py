@@ -83,6 +83,14 @@ def test_the_first_method_is_ahead() -> None:
     assert verdict(synthetic_result("ahead", nerf={2: (20.0, 0.1, 0.0)})).startswith("no: ")
 
 
+def test_who_is_ahead_is_so_of_the_best_other_method() -> None:
+    result = synthetic_result("ahead")
+    result["variants"]["4 cameras"]["methods"]["idr"] = of_method(31.0, 0.7, 0.05, 4, 0.1)
+    assert verdict(result).startswith(
+        "no: 4 cameras: fast 30.0 dB, idr 31.0 dB; 4 cameras: fast Chamfer 0.100, nerf Chamfer 0.500; "
+    )
+
+
 def without_fast(check: str, cameras: int) -> dict[str, Any]:
     """Return a result from two, four and eight cameras in which H-NeRF failed with one number of them."""
     result = synthetic_result(check)
