@@ -196,8 +196,8 @@ def _check_determined(
     length, width = np.linalg.svd(centres - centres.mean(0))[1][:2]
     if unknown_focal and width < COLLINEAR * length:
         raise InputError(
-            "all cameras stand in one line, which leaves their focal length open; give it (--fov or --lens), or place "
-            "a camera elsewhere"
+            "all cameras stand in one line, which leaves their focal length open; give it (--fov or --lens), or add "
+            "a camera beside that line"
         )
 
 
