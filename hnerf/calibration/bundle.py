@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hnerf.capture.lens import undistort_points
+from hnerf.capture.lens import undistort_keypoints
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import reprojection_px, triangulate
@@ -124,7 +124,7 @@ def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], shared: np.ndarr
         if not (shared[i] and k1):
             continue
         seen = keypoints[i, :, 2] > 0
-        straight[i, seen, :2] = undistort_points(keypoints[i, seen, :2], camera.K, np.array([k1, 0, 0, 0]))
+        straight[i, seen] = undistort_keypoints(keypoints[i, seen], camera.K, np.array([k1, 0, 0, 0]))
     return straight
 
 

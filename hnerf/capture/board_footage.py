@@ -142,7 +142,8 @@ def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]
             )
         seen = np.isfinite(footage.corners_px[name][..., :1])
         corners = np.concatenate([np.nan_to_num(footage.corners_px[name]), seen], -1)
-        corners_px.append(np.where(seen, normalisers[name].keypoints(corners)[..., :2], np.nan))
+        straight = normalisers[name].keypoints(corners)
+        corners_px.append(np.where(straight[..., 2:] > 0, straight[..., :2], np.nan))
     return BoardCorners(names, footage.board.corners_m, np.array(corners_px), footage.frame_step)
 
 

@@ -233,11 +233,13 @@ def _subject_point(
     manifest: CaptureManifest, normalisers: dict[str, Normaliser], frames: tuple[int, ...]
 ) -> SubjectPoint | None:
     """Return the point that names the subject, in pixels of the normalised image of the chosen frame nearest to its
-    own (the first one where it names none)."""
+    own (the first one where it names none). Raises InputError where the lens pictures no such point."""
     point = manifest.subject_point
     if point is None or not point.camera:
         return point
-    x, y, _ = normalisers[point.camera].keypoints(np.array([*point.at, 1.0]))
+    x, y, pictured = normalisers[point.camera].keypoints(np.array([*point.at, 1.0]))
+    if not pictured:
+        raise InputError(f"capture.toml: subject: {point.at} is beyond the lens of camera {point.camera}; correct it")
     frame = min(frames, key=lambda chosen: abs(chosen - point.frame))
     return SubjectPoint((float(x), float(y)), point.camera, frame)
 

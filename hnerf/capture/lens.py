@@ -16,6 +16,7 @@ MAX_SKEW_PX = 0.1  # of a camera with distortion, which OpenCV undistorts as if 
 MAX_NUMBER = 1e9  # of a calibration; beyond it, later arithmetic overflows
 # OpenCV's default of 5 iterations is off by pixels.
 UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)
+MAX_OFF_PX = 1.0  # between a recorded pixel and the picture of the ray that was found for it
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,23 @@ def pinhole(camera: Camera) -> Lens:
 
 
 def undistort_points(points_px: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Map pixels (..., 2) of a recorded image to those of the pinhole camera with the same K; NaN stays."""
+    """Map pixels (..., 2) of a recorded image to those of the pinhole camera with the same K; NaN stays, and stands
+    where the lens pictures nothing, for which OpenCV returns any pixel."""
     if points_px.size == 0:  # for which OpenCV returns None
         return points_px
     flat = np.ascontiguousarray(points_px.reshape(-1, 1, 2))
-    return cv2.undistortPoints(flat, K, distortion, P=K, criteria=UNDISTORTED).reshape(points_px.shape)
+    straight = cv2.undistortPoints(flat, K, distortion, P=K, criteria=UNDISTORTED)
+    rays = cv2.convertPointsToHomogeneous(straight)[:, 0] @ np.linalg.inv(K).T
+    pictured = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, distortion)[0]
+    straight[~(np.linalg.norm(pictured - flat, axis=-1) < MAX_OFF_PX)] = np.nan
+    return straight.reshape(points_px.shape)
+
+
+def undistort_keypoints(keypoints: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Map keypoints (..., 3) x_px, y_px, confidence as `undistort_points` does; 0 where the lens pictures nothing."""
+    straight = undistort_points(keypoints[..., :2], K, distortion)
+    pictured = np.isfinite(straight).all(-1, keepdims=True)
+    return np.where(pictured, np.concatenate([straight, keypoints[..., 2:]], -1), 0.0)
 
 
 def known_size(lens: Lens) -> tuple[int, int]:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import read_rgb, write_image
-from hnerf.capture.lens import Lens, undistort_points
+from hnerf.capture.lens import Lens, undistort_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
@@ -58,12 +58,11 @@ class Normaliser:
 
     def keypoints(self, recorded: np.ndarray) -> np.ndarray:
         """Convert recorded keypoints (..., 25, 3) x_px, y_px, confidence to the linear camera; points without
-        confidence become zero."""
-        xy = recorded[..., :2]
+        confidence, and those where the lens pictures nothing, become zero."""
         if self.maps is not None:
-            xy = undistort_points(xy, self.lens.K, self.lens.distortion)
+            recorded = undistort_keypoints(recorded, self.lens.K, self.lens.distortion)
         scale = np.array(self.camera.size_px) / self.recorded_size_px
-        xy = xy * scale + (scale - 1) / 2  # pixel centres at integers
+        xy = recorded[..., :2] * scale + (scale - 1) / 2  # pixel centres at integers
         return np.concatenate([xy, recorded[..., 2:]], -1) * (recorded[..., 2:] > 0)
 
     def write_image(self, rgb: np.ndarray, source: Path, verbatim: Path | None, target: Path) -> None:

@@ -227,6 +227,10 @@ EASYMOCAP = {
         _toml('subject = "nearest to (1, 2) in 01 at frame 999"\n'),
         "capture.toml: subject: frame 999 is none of the recording's frames 0 to 4; correct it",
     ),
+    "toml with a subject beyond what the lens pictures": (
+        lambda f: [rec.write_calibration(f, (-0.3, 0, 0, 0)), _toml('subject = "nearest to (31, 7) in 01"\n')(f)],
+        "capture.toml: subject: (31.0, 7.0) is beyond the lens of camera 01; correct it",
+    ),
     "toml with a subject in no camera": (_toml('subject = "nearest to (1, 2) in 07"\n'), "no training camera 07"),
     "toml with an impossible field of view": (_toml("field_of_view_deg = 200\n"), "field_of_view_deg"),
     "toml name leaves the store": (_toml('name = "../../other"\n'), "name '../../other'"),

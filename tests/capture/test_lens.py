@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.capture.lens import undistort_points
+from hnerf.capture.lens import undistort_keypoints, undistort_points
 
 
 def test_undistortion_keeps_what_is_absent_absent() -> None:
@@ -19,3 +19,11 @@ def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:
     directions = np.c_[(straight - (960, 540)) / 1100, np.ones(4)]
     bent = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
     np.testing.assert_allclose(undistort_points(bent, K, distortion), straight, atol=0.01)
+
+
+def test_what_no_ray_reaches_is_absent() -> None:
+    """At radius r the lens pictures r (1 - 0.3 r^2): 0.4625 at 0.5, and at most 0.703, which 80 px of 100 exceed."""
+    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    found = undistort_keypoints(np.array([[96.25, 50, 0.9], [130, 50, 0.9]]), K, np.array([-0.3, 0, 0, 0]))
+    assert found[0].tolist() == pytest.approx([100, 50, 0.9], abs=0.01)
+    assert found[1].tolist() == [0, 0, 0]

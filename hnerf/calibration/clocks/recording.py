@@ -12,7 +12,7 @@ from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.capture.clocks import frame_times_s
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.ingest import DEFAULT_FPS, ingest, recognise
-from hnerf.capture.lens import Lens, undistort_points
+from hnerf.capture.lens import Lens, undistort_keypoints
 from hnerf.capture.manifest import read_manifest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
@@ -66,7 +66,7 @@ def _track(folder: Path, name: str, footage: Footage, fps: float, lens: Lens | N
     scale = np.array(capture.recorded_sizes_px[name]) / capture.cameras[name].size_px
     keypoints[..., :2] = keypoints[..., :2] * scale + (scale - 1) / 2
     if lens is not None and name not in capture.recorded_lenses:  # by which its images would be undistorted
-        keypoints[..., :2] = undistort_points(keypoints[..., :2], lens.K, lens.distortion)
+        keypoints = undistort_keypoints(keypoints, lens.K, lens.distortion)
     rows = np.searchsorted(footage.frames, capture.frames)
     return Track(frame_times_s(footage, fps)[rows], keypoints)
 
