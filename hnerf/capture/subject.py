@@ -70,7 +70,7 @@ def _detected(capture: Capture) -> list[np.ndarray]:
             raise InputError(
                 f"{capture.name}: camera {name}: no keypoints; set detection.source=network, or detect some"
             )
-        people.append(np.nan_to_num(found).astype(np.float64))
+        people.append(np.where(np.isfinite(found).all(-1, keepdims=True), found, 0.0))
     seen = np.array([(p[..., 2] > 0).any((1, 2)) for p in people])  # (cameras, frames)
     if not (seen.sum(0) >= min(2, len(names))).any():
         raise InputError(f"{capture.name}: {_too_few(names, seen)}")

@@ -182,6 +182,14 @@ def test_one_of_several_cameras_is_one_line(tmp_path: Path) -> None:
         subject_keypoints(write_capture(tmp_path, cameras, seen))
 
 
+def test_a_keypoint_that_is_no_place_is_not_seen(tmp_path: Path) -> None:
+    capture, (subject,) = recorded(tmp_path, ring(1), walk_m())
+    subject["c0"][3, 7, 0] = np.nan
+    capture = write_capture(tmp_path, list(capture.cameras.values()), {"c0": subject["c0"][:, None]})
+    found = subject_keypoints(capture)["c0"][3]
+    assert found[7].tolist() == [0, 0, 0] and np.array_equal(found[8], subject["c0"][3, 8])
+
+
 def test_a_camera_without_keypoints_is_told_how_to_get_them(tmp_path: Path) -> None:
     """The network is not used by itself, since the other camera's keypoints came with the recording."""
     capture, _ = recorded(tmp_path, ring(2), walk_m())
