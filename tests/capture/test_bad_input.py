@@ -171,6 +171,10 @@ EASYMOCAP = {
         "000001_keypoints.json",
     ),
     "keypoints in shares of the picture": (_scale_keypoints(0.1), "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to"),
+    "keypoints in shares of the picture, one below its border": (
+        lambda f: [_scale_keypoints(0.1)(f), _edit(f / "openpose/01/000001_keypoints.json", "0.5", "1.02")],
+        "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to 1.02 are not in the pixels",
+    ),
     "keypoints of larger pictures": (_scale_keypoints(4), "not in the pixels of pictures of 24 x 16"),
     "keypoint whose mean with another overflows": (_far_shoulder, "000001_keypoints.json: a keypoint is beyond 1e+06"),
     "NaN keypoint": (_nan_keypoint, "000001_keypoints.json"),
