@@ -60,7 +60,7 @@ class Colmap(EasyMocap):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         """Return whether the folder looks like this layout."""
-        return (folder / "sparse").is_dir() and not (folder / "intri.yml").exists()
+        return (folder / "sparse").is_dir() and not EasyMocap.recognises(folder)
 
     def lenses(self) -> dict[str, Lens]:
         """Return one camera for each image of the model."""

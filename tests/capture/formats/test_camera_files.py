@@ -127,6 +127,18 @@ def test_what_is_written_reads_back(layout: str, reader: type[Layout], tmp_path:
         assert np.allclose(*padded, atol=1e-12)
 
 
+@pytest.mark.parametrize(("layout", "reader"), [("colmap", Colmap), ("caliscope", Caliscope)])
+def test_intrinsics_beside_another_calibration_take_no_precedence(
+    layout: str, reader: type[Layout], tmp_path: Path
+) -> None:
+    """Only with `extri.yml` are they a calibration."""
+    write_cameras(tmp_path, LENSES, "easymocap")
+    write_cameras(tmp_path, LENSES, layout)
+    assert type(recognise(tmp_path)) is EasyMocap
+    (tmp_path / "extri.yml").unlink()
+    assert type(recognise(tmp_path)) is reader
+
+
 @pytest.mark.parametrize("layout", ["colmap", "caliscope", "aniposelib"])
 def test_files_that_must_say_a_size_are_not_written_without(layout: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="camera cam_3 has no size; add W_cam_3 and H_cam_3"):
