@@ -54,7 +54,7 @@ class Network:
             reason = " ".join(str(error).split())
             raise InputError(f"{self.path}: does not run on {values.shape}: {reason}; export it for any size") from None
         found = np.squeeze(outputs[0])
-        if found.ndim != 2 or found.min() < -TOLERANCE or found.max() > 1 + TOLERANCE:
+        if found.ndim != 2 or not (found.min() >= -TOLERANCE and found.max() <= 1 + TOLERANCE):
             raise InputError(
                 f"{self.path}: its first output must be one map of probabilities; it is {found.shape}, "
                 f"from {found.min():.3g} to {found.max():.3g}"

@@ -80,6 +80,13 @@ def test_files_that_are_no_such_network(tmp_path: Path) -> None:
         Network(flat)
 
 
+def test_a_network_whose_output_is_no_number_is_refused(tmp_path: Path) -> None:
+    """A NaN is neither below 0 nor above 1."""
+    path = write_network(tmp_path / "n.onnx", [1, 3, "H", "W"], gain=float("nan"))
+    with pytest.raises(InputError, match=r"n\.onnx: its first output must be one map of probabilities; it is .* nan"):
+        Network(path).probability(np.zeros((10, 20, 3), np.uint8))
+
+
 def test_a_network_that_loads_but_does_not_run(tmp_path: Path) -> None:
     """The network accepts any height and width, but then needs 4 x 4 pixels."""
     size = helper.make_tensor("size", TensorProto.INT64, [4], [1, 3, 4, 4])
