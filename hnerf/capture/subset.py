@@ -58,9 +58,12 @@ def subset(
 
 
 def _subject_point(capture: Capture, kept: Capture) -> SubjectPoint | None:
-    """Return the point that names the subject; where its camera is left out, a keypoint of the person in another."""
+    """Return the point that names the subject; where its camera or frame is left out, a keypoint of the person in
+    another."""
     point = capture.subject_point
-    if point is None or point.camera in ("", *kept.train_cameras) or capture.keypoints(point.camera) is None:
+    if point is None or not point.camera or capture.keypoints(point.camera) is None:
+        return point
+    if point.camera in kept.train_cameras and point.frame in kept.frames:
         return point
     found = subject_keypoints(capture)
     for name, frame in product(kept.train_cameras, kept.frames):

@@ -9,7 +9,7 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import subset
 from hnerf.errors import InputError
 from tests.calibration.synthetic import ring
-from tests.capture.test_subject import recorded, share_right, staying
+from tests.capture.test_subject import recorded, share_right, staying, walking
 from tests.study.recording import write_landmarks, write_recording
 
 
@@ -60,6 +60,17 @@ def test_who_is_named_in_a_camera_left_out_is_named_in_another(tmp_path: Path) -
     few = Capture.load(tmp_path / "few")
     assert few.subject_point is not None and few.subject_point.camera == "c0"
     assert share_right(subject_keypoints(few), {name: each[1][name] for name in ("c0", "c2")}) == 1
+
+
+def test_who_is_named_in_a_frame_left_out_is_named_in_another(tmp_path: Path) -> None:
+    """They have changed places by then: the other one is nearest to the point."""
+    people_m = walking((-1.2, -0.3), (1.2, -0.3)), walking((1.2, 0.3), (-1.2, 0.3))
+    capture, each = recorded(tmp_path / "all", ring(3), *people_m)
+    x, y, _ = each[0]["c1"][0, 0]
+    capture = dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c1", 0))
+    subset(capture, tmp_path / "few", None, tuple(range(22, 30)), ())
+    late = {name: seen[22:] for name, seen in each[0].items()}
+    assert share_right(subject_keypoints(Capture.load(tmp_path / "few")), late) == 1
 
 
 def test_none_keeps_everything(tmp_path: Path) -> None:
