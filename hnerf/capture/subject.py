@@ -93,6 +93,11 @@ def _distance(capture: Capture, point: SubjectPoint, person: PersonTrack) -> flo
     seen."""
     if not point.camera:
         cameras = [capture.cameras[name] for name in capture.train_cameras]
+        if len(cameras) == 1:
+            raise InputError(
+                f"{capture.name}: capture.toml: subject: one camera tells no places on the ground; name a point in its "
+                "image"
+            )
         middle = person.keypoints[:, :, MIDDLE].reshape(len(cameras), -1, 3)
         points_m = triangulate(np.stack([camera.projection for camera in cameras]), middle)[0]
         ground = points_m[:, ["xyz".index(axis) for axis in "xyz" if axis != capture.up]]

@@ -169,9 +169,14 @@ def test_who_is_named_is_taken(chosen: int, tmp_path: Path) -> None:
 
 
 def test_nobody_at_the_point_is_one_line(tmp_path: Path) -> None:
-    capture, _ = recorded(tmp_path, ring(1), staying((0, -0.6)), staying((0, 0.6)))
-    with pytest.raises(InputError, match="subject: nobody is found there"):
-        subject_keypoints(dataclasses.replace(capture, subject_point=SubjectPoint((0, 0))))
+    """In frame 5 both are elsewhere; and one camera tells no places on the ground."""
+    people_m = staying((0, -0.6)), staying((0, 0.6))
+    for joints_m in people_m:
+        joints_m[5] = 100.0
+    capture, _ = recorded(tmp_path, ring(1), *people_m)
+    for point, why in ((SubjectPoint((0, 0), "c0", 5), "nobody is found there"), (SubjectPoint((0, 0)), "in its im")):
+        with pytest.raises(InputError, match=f"capture.toml: subject: .*{why}"):
+            subject_keypoints(dataclasses.replace(capture, subject_point=point))
 
 
 def test_one_of_several_cameras_is_one_line(tmp_path: Path) -> None:
