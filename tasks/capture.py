@@ -11,7 +11,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("capture", version="14")
+@stage("capture", version="15")
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
     """Read a recording in any supported layout; undistort and normalise it."""
     capture = ingest_folder(source.root, settings, out)
@@ -19,7 +19,7 @@ def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, fl
     return {"cameras": len(capture.cameras), "frames": len(capture.frames)}
 
 
-@stage("subset", version="3")
+@stage("subset", version="4")
 def subset_capture(
     out: Path,
     recording: Artifact,
