@@ -11,12 +11,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from hnerf.asset.compact_glb import compact_glb
 from hnerf.capture.capture import Capture
 from hnerf.evaluation.pictures import data_uri, shrunk
+from hnerf.evaluation.report import report_environment
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.models import LICENCES, THREE_SHA256, has_model, model_file
@@ -50,12 +50,10 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
         "modules": _packed(json.dumps(_modules()).encode()),
         "recording": _packed(json.dumps(recording(capture, stage_from_world)).encode()),
     }
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(PAGE), autoescape=True, undefined=jinja2.StrictUndefined
-    )
+    template = report_environment(PAGE).get_template("viewer.html")
     for texture_px in TEXTURES_PX:
         avatar = _packed(compact_glb(glb.read_bytes(), texture_px))
-        page = environment.get_template("viewer.html").render(avatar=avatar, **parts)
+        page = template.render(avatar=avatar, **parts)
         if len(page.encode()) <= MAX_BYTES:
             break
     else:
