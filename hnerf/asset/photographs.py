@@ -137,7 +137,7 @@ def photographed_texels(
         image = capture.image(name, frame)
         index, cosine, normals, pixels_px = visible_texels(camera, surfaces[frame], texels)
         x, y = np.round(pixels_px).astype(int).T
-        at, pixel = _distinct(y * camera.width_px + x, camera.width_px * camera.height_px)
+        at, pixel = np.unique(y * camera.width_px + x, return_inverse=True)
         colours = (image.reshape(-1, 3)[at] / 255 / gain).astype(np.float32)
         pixels = TexelPixels(index.astype(np.int32), pixel.astype(np.int32), colours)
         return SeenTexels(pixels, cosine, normals, sampled(image, pixels_px) / gain)
@@ -206,11 +206,3 @@ def sampled(image: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the products (M,) of the rows of two arrays (M, 3); a sum along so short an axis is slower."""
     return np.einsum("mk,mk->m", a, b)
-
-
-def _distinct(values: np.ndarray, end: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct ones of whole numbers (M,) below an end, and which of them each is, as `np.unique` does, but
-    without sorting."""
-    present = np.zeros(end, bool)
-    present[values] = True
-    return np.flatnonzero(present), (np.cumsum(present, dtype=np.int32) - 1)[values]
