@@ -1,5 +1,4 @@
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -53,37 +52,24 @@ def change(attribute: Usd.Attribute, index: int, value: object, time: float | No
     attribute.Set(values, at)
 
 
-def heavy_weight(stage: Usd.Stage) -> None:
-    change(UsdSkel.BindingAPI(mesh(stage)).GetJointWeightsAttr(), 0, 0.3)
+def points(stage: Usd.Stage) -> Usd.Attribute:
+    return mesh(stage).GetPointsAttr()
 
 
-def joint_out_of_range(stage: Usd.Stage) -> None:
-    change(UsdSkel.BindingAPI(mesh(stage)).GetJointIndicesAttr(), 0, 3)  # there are three joints
+def shape(stage: Usd.Stage, name: str) -> UsdSkel.BlendShape:
+    return UsdSkel.BlendShape(stage.GetPrimAtPath(f"{BODY}/Surface/{name}"))
 
 
-def point_not_a_number(stage: Usd.Stage) -> None:
-    change(mesh(stage).GetPointsAttr(), 5, Gf.Vec3f(np.nan, 0, 0))
+def joints(stage: Usd.Stage, *names: str) -> None:
+    skeleton(stage).GetJointsAttr().Set(names)
 
 
-def face_out_of_range(stage: Usd.Stage) -> None:
-    change(mesh(stage).GetFaceVertexIndicesAttr(), 0, len(mesh(stage).GetPointsAttr().Get()))
-
-
-def centimetres(stage: Usd.Stage) -> None:
-    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+def turned(stage: Usd.Stage, *quaternions: Gf.Quatf) -> None:
+    motion(stage).GetRotationsAttr().Set(Vt.QuatfArray(quaternions), 5.0)
 
 
 def giant(stage: Usd.Stage) -> None:
-    points = mesh(stage).GetPointsAttr()
-    points.Set(Vt.Vec3fArray.FromNumpy(np.array(points.Get()) * 100))
-
-
-def no_extent(stage: Usd.Stage) -> None:
-    mesh(stage).GetExtentAttr().Set(Vt.Vec3fArray([Gf.Vec3f(0), Gf.Vec3f(0)]))
-
-
-def uv_outside(stage: Usd.Stage) -> None:
-    change(UsdGeom.PrimvarsAPI(mesh(stage)).GetPrimvar("st").GetAttr(), 0, Gf.Vec2f(1.5, 0))
+    points(stage).Set(Vt.Vec3fArray.FromNumpy(np.array(points(stage).Get()) * 100))
 
 
 def uvs_missing(stage: Usd.Stage) -> None:
@@ -91,147 +77,72 @@ def uvs_missing(stage: Usd.Stage) -> None:
     st.SetIndices(Vt.IntArray(list(st.GetIndices())[:-1]))
 
 
-def dotted_joint(stage: Usd.Stage) -> None:
-    skeleton(stage).GetJointsAttr().Set(["root", "root/pelvis", "root/pelvis/upper.L"])
-
-
-def stretched_quaternion(stage: Usd.Stage) -> None:
-    motion(stage).GetRotationsAttr().Set(Vt.QuatfArray([Gf.Quatf(2, 0, 0, 0)] * 3), 5.0)
-
-
-def joint_without_transform(stage: Usd.Stage) -> None:
-    motion(stage).GetRotationsAttr().Set(Vt.QuatfArray([Gf.Quatf(1, 0, 0, 0)] * 2), 5.0)
-
-
-def sheared_bind(stage: Usd.Stage) -> None:
-    change(skeleton(stage).GetBindTransformsAttr(), 2, Gf.Matrix4d(2))
-
-
-def rest_elsewhere(stage: Usd.Stage) -> None:
-    change(skeleton(stage).GetRestTransformsAttr(), 2, Gf.Matrix4d(1))
-
-
-def no_ground_root(stage: Usd.Stage) -> None:
-    skeleton(stage).GetJointsAttr().Set(["hips", "hips/spine", "hips/spine/upper_L"])
-
-
-def nameless_rest_pose(stage: Usd.Stage) -> None:
-    skeleton(stage).GetPrim().SetCustomDataByKey("restPose", "")
-
-
 def floating(stage: Usd.Stage) -> None:
-    points = mesh(stage).GetPointsAttr()
-    points.Set(Vt.Vec3fArray.FromNumpy((np.array(points.Get()) + np.array([0, 0.3, 0])).astype(np.float32)))
-    extent = np.array(mesh(stage).GetExtentAttr().Get()) + np.array([0, 0.3, 0])
-    mesh(stage).GetExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
+    for attribute in (points(stage), mesh(stage).GetExtentAttr()):
+        raised = np.array(attribute.Get()) + np.array([0, 0.3, 0])
+        attribute.Set(Vt.Vec3fArray.FromNumpy(raised.astype(np.float32)))
 
 
 def one_eye(stage: Usd.Stage) -> None:
-    skeleton(stage).GetJointsAttr().Set(["root", "root/pelvis", "root/pelvis/eye_L"])
-
-
-def short_shape(stage: Usd.Stage) -> None:
-    shape = UsdSkel.BlendShape(stage.GetPrimAtPath(f"{BODY}/Surface/corrective_01"))
-    shape.GetOffsetsAttr().Set([Gf.Vec3f(0)] * 5)
-
-
-def shape_of_no_point(stage: Usd.Stage) -> None:
-    frown = UsdSkel.BlendShape(stage.GetPrimAtPath(f"{BODY}/Surface/frown"))
-    change(frown.GetPointIndicesAttr(), 0, len(mesh(stage).GetPointsAttr().Get()))
+    joints(stage, "root", "root/pelvis", "root/pelvis/eye_L")
 
 
 def short_expression(stage: Usd.Stage) -> None:
-    frown = UsdSkel.BlendShape(stage.GetPrimAtPath(f"{BODY}/Surface/frown"))
-    frown.GetOffsetsAttr().Set(frown.GetOffsetsAttr().Get()[:-1])
-
-
-def shape_without_target(stage: Usd.Stage) -> None:
-    UsdSkel.BindingAPI(mesh(stage)).GetBlendShapesAttr().Set(["smile"])
-
-
-def negative_weight(stage: Usd.Stage) -> None:
-    change(motion(stage).GetBlendShapeWeightsAttr(), 0, -0.5, 5.0)
-
-
-def no_colours(stage: Usd.Stage) -> None:
-    mesh(stage).GetDisplayColorAttr().Set([Gf.Vec3f(1)])
-
-
-def no_material(stage: Usd.Stage) -> None:
-    UsdShade.MaterialBindingAPI(mesh(stage)).UnbindDirectBinding()
-
-
-def no_kind(stage: Usd.Stage) -> None:
-    Usd.ModelAPI(stage.GetDefaultPrim()).SetKind("assembly")
-
-
-def no_identifier(stage: Usd.Stage) -> None:
-    stage.GetDefaultPrim().ClearAssetInfoByKey("identifier")
+    offsets = shape(stage, "frown").GetOffsetsAttr()
+    offsets.Set(offsets.Get()[:-1])
 
 
 def small_hint(stage: Usd.Stage) -> None:
     UsdGeom.ModelAPI(stage.GetDefaultPrim()).SetExtentsHint([Gf.Vec3f(0), Gf.Vec3f(1)])
 
 
-def no_hint(stage: Usd.Stage) -> None:
-    UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Block()
+# What damages a stage of three joints, by what is then said of it.
+DAMAGE = {
+    "do not sum to 1": lambda s: change(UsdSkel.BindingAPI(mesh(s)).GetJointWeightsAttr(), 0, 0.3),
+    "joint index out of range": lambda s: change(UsdSkel.BindingAPI(mesh(s)).GetJointIndicesAttr(), 0, 3),
+    "points are not finite": lambda s: change(points(s), 5, Gf.Vec3f(np.nan, 0, 0)),
+    "face index out of range": lambda s: change(mesh(s).GetFaceVertexIndicesAttr(), 0, len(points(s).Get())),
+    "not a person's size": giant,
+    "extent does not contain the points": lambda s: mesh(s).GetExtentAttr().Set([Gf.Vec3f(0), Gf.Vec3f(0)]),
+    "outside [0, 1]": lambda s: change(UsdGeom.PrimvarsAPI(mesh(s)).GetPrimvar("st").GetAttr(), 0, Gf.Vec2f(1.5, 0)),
+    "texture coordinates for": uvs_missing,
+    "joint names are not identifiers": lambda s: joints(s, "root", "root/pelvis", "root/pelvis/upper.L"),
+    "quaternions are not finite or not of unit length": lambda s: turned(s, *[Gf.Quatf(2, 0, 0, 0)] * 3),
+    "does not have one transform per joint": lambda s: turned(s, *[Gf.Quatf(1, 0, 0, 0)] * 2),
+    "bindTransforms are no rotations": lambda s: change(skeleton(s).GetBindTransformsAttr(), 2, Gf.Matrix4d(2)),
+    "do not compose to bindTransforms": lambda s: change(skeleton(s).GetRestTransformsAttr(), 2, Gf.Matrix4d(1)),
+    "no root on the ground with a pelvis": lambda s: joints(s, "hips", "hips/spine", "hips/spine/upper_L"),
+    "does not name its rest pose": lambda s: skeleton(s).GetPrim().SetCustomDataByKey("restPose", ""),
+    "its lowest point at rest is at height 0.3 m": floating,
+    "skin follows one eye and not the other": one_eye,
+    "eye_L does not turn about the middle of its ball": one_eye,
+    "corrective_01: offsets are not finite or not one a point": lambda s: (
+        shape(s, "corrective_01").GetOffsetsAttr().Set([Gf.Vec3f(0)] * 5)
+    ),
+    "1 blend shapes but 4 targets": lambda s: UsdSkel.BindingAPI(mesh(s)).GetBlendShapesAttr().Set(["smile"]),
+    "frown: point index": lambda s: change(shape(s, "frown").GetPointIndicesAttr(), 0, len(points(s).Get())),
+    "frown: offsets are not finite or not one a point": short_expression,
+    "are not one a shape from 0 to 1 at time 5": lambda s: change(motion(s).GetBlendShapeWeightsAttr(), 0, -0.5, 5.0),
+    "1 display colours for its points": lambda s: mesh(s).GetDisplayColorAttr().Set([Gf.Vec3f(1)]),
+    "Surface: no material is bound": lambda s: UsdShade.MaterialBindingAPI(mesh(s)).UnbindDirectBinding(),
+    "kind is assembly, not component": lambda s: Usd.ModelAPI(s.GetDefaultPrim()).SetKind("assembly"),
+    "extentsHint does not contain /Avatar/Body at time": small_hint,
+    "has no extentsHint": lambda s: UsdGeom.ModelAPI(s.GetDefaultPrim()).GetExtentsHintAttr().Block(),
+}
+OF_ROOT_LAYER = {  # likewise, by metadata that only the root layer has
+    "metersPerUnit is 0.01": lambda s: UsdGeom.SetStageMetersPerUnit(s, 0.01),
+    "assetInfo has no identifier": lambda s: s.GetDefaultPrim().ClearAssetInfoByKey("identifier"),
+    "timeCodesPerSecond and framesPerSecond differ": lambda s: s.SetFramesPerSecond(24),
+    "ends before it starts": lambda s: s.SetEndTimeCode(-1),
+    "has no default prim": lambda s: s.ClearDefaultPrim(),
+}
 
 
-def two_rates(stage: Usd.Stage) -> None:
-    stage.SetFramesPerSecond(24)
-
-
-def backwards(stage: Usd.Stage) -> None:
-    stage.SetEndTimeCode(-1)
-
-
-def no_default_prim(stage: Usd.Stage) -> None:
-    stage.ClearDefaultPrim()
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (heavy_weight, "do not sum to 1"),
-        (joint_out_of_range, "joint index out of range"),
-        (point_not_a_number, "points are not finite"),
-        (face_out_of_range, "face index out of range"),
-        (centimetres, "metersPerUnit is 0.01"),
-        (giant, "not a person's size"),
-        (no_extent, "extent does not contain the points"),
-        (uv_outside, "outside [0, 1]"),
-        (uvs_missing, "texture coordinates for"),
-        (dotted_joint, "joint names are not identifiers"),
-        (stretched_quaternion, "quaternions are not finite or not of unit length"),
-        (joint_without_transform, "does not have one transform per joint"),
-        (sheared_bind, "bindTransforms are no rotations"),
-        (rest_elsewhere, "restTransforms do not compose to bindTransforms"),
-        (no_ground_root, "no root on the ground with a pelvis below it"),
-        (nameless_rest_pose, "does not name its rest pose"),
-        (floating, "its lowest point at rest is at height 0.3 m"),
-        (one_eye, "skin follows one eye and not the other"),
-        (one_eye, "eye_L does not turn about the middle of its ball"),
-        (short_shape, "corrective_01: offsets are not finite or not one a point"),
-        (shape_without_target, "1 blend shapes but 4 targets"),
-        (shape_of_no_point, "frown: point index out of range"),
-        (short_expression, "frown: offsets are not finite or not one a point"),
-        (negative_weight, "blend shape weights are not one a shape from 0 to 1 at time 5"),
-        (no_colours, "1 display colours for its points"),
-        (no_material, "/Avatar/Body/Surface: no material is bound"),
-        (no_kind, "kind is assembly, not component"),
-        (no_identifier, "assetInfo has no identifier"),
-        (small_hint, "extentsHint does not contain /Avatar/Body at time"),
-        (no_hint, "has no extentsHint"),
-        (two_rates, "timeCodesPerSecond and framesPerSecond differ"),
-        (backwards, "ends before it starts"),
-        (no_default_prim, "has no default prim"),
-    ],
-)
-def test_each_defect_is_named(stage: Usd.Stage, damage: Callable[[Usd.Stage], None], message: str) -> None:
+@pytest.mark.parametrize("message", [*DAMAGE, *OF_ROOT_LAYER])
+def test_each_defect_is_named(stage: Usd.Stage, message: str) -> None:
     assert data_defects(stage) == []
-    of_root_layer = (centimetres, two_rates, backwards, no_default_prim, no_identifier)
-    stage.SetEditTarget(stage.GetRootLayer() if damage in of_root_layer else stage.GetSessionLayer())
-    damage(stage)
+    stage.SetEditTarget(stage.GetSessionLayer() if message in DAMAGE else stage.GetRootLayer())
+    (DAMAGE | OF_ROOT_LAYER)[message](stage)
     assert message in "; ".join(data_defects(stage))
 
 
@@ -239,9 +150,9 @@ def test_eyes_turn_about_the_middle_of_their_balls(stage: Usd.Stage) -> None:
     """What follows the upper joint is 36 cm wide: its joint may be 10 % of 18 cm off the middle."""
     stage.SetEditTarget(stage.GetSessionLayer())
     binding = UsdSkel.BindingAPI(mesh(stage))
-    joints, weights = (np.array(a.Get()) for a in (binding.GetJointIndicesPrimvar(), binding.GetJointWeightsPrimvar()))
-    on_eye = ((joints == 2) & (weights > 0)).reshape(len(mesh(stage).GetPointsAttr().Get()), -1).any(1)
-    ball = np.array(mesh(stage).GetPointsAttr().Get())[on_eye]
+    bound, weights = (np.array(a.Get()) for a in (binding.GetJointIndicesPrimvar(), binding.GetJointWeightsPrimvar()))
+    on_eye = ((bound == 2) & (weights > 0)).reshape(len(points(stage).Get()), -1).any(1)
+    ball = np.array(points(stage).Get())[on_eye]
     one_eye(stage)
     for off_m, wrong in ((0.017, False), (0.019, True)):
         middle = (ball.min(0) + ball.max(0)) / 2 + (off_m, 0, 0)
@@ -261,9 +172,9 @@ def test_a_game_rig_has_few_influences(stage: Usd.Stage) -> None:
     stage.SetEditTarget(stage.GetSessionLayer())
     stage.GetDefaultPrim().GetVariantSet("rig").SetVariantSelection("game")
     assert data_defects(stage) == []
-    binding, points = UsdSkel.BindingAPI(mesh(stage)), len(mesh(stage).GetPointsAttr().Get())
-    binding.CreateJointIndicesPrimvar(False, 5).Set([0, 1, 2, 2, 2] * points)
-    binding.CreateJointWeightsPrimvar(False, 5).Set([0.2] * 5 * points)
+    binding, count = UsdSkel.BindingAPI(mesh(stage)), len(points(stage).Get())
+    binding.CreateJointIndicesPrimvar(False, 5).Set([0, 1, 2, 2, 2] * count)
+    binding.CreateJointWeightsPrimvar(False, 5).Set([0.2] * 5 * count)
     assert "5 influences; the game rig has at most 4" in "; ".join(data_defects(stage))
 
 
