@@ -17,7 +17,7 @@ UNITS_S = {"d": 86400, "h": 3600, "m": 60, "s": 1}
 
 
 def list_(options: argparse.Namespace) -> None:
-    """List the subjects: size, first and latest result, and recording."""
+    """List the subjects: size, first and latest result, and capture folder."""
     from tasks.garbage import find_garbage
     from tasks.inventory import NOBODY, Inventory, recording_of
 
