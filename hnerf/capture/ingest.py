@@ -57,7 +57,7 @@ DEFAULT_FPS = 30.0  # of images, whose files state none
 SIZE_TOLERANCE = 0.02
 RATE_TOLERANCE = 0.01  # between frame rates, as a share
 MIN_KEPT_SHARE = 0.5  # of an undistorted picture: a lens takes less than a fifth of it
-MAX_STRANGE_SHARE = 0.5  # of keypoints outside their images, where detectors guess some, or in the first pixel
+MAX_MISPLACED_SHARE = 0.5  # of keypoints outside their images, where detectors guess some, or in the first pixel
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
     PeopleSnapshot,
@@ -422,8 +422,8 @@ def _check_in_pixels(place: Path, points: np.ndarray, picture: VideoFrame) -> No
     size_px = np.array(picture.rgb.shape[1::-1])
     if not len(points):
         return
-    strange = ((points < 0) | (points > size_px)).any(-1) | (points <= 1).all(-1)
-    if strange.mean() > MAX_STRANGE_SHARE:
+    misplaced = ((points < 0) | (points > size_px)).any(-1) | (points <= 1).all(-1)
+    if misplaced.mean() > MAX_MISPLACED_SHARE:
         spans = " and ".join(f"{low:.4g} to {high:.4g}" for low, high in zip(points.min(0), points.max(0), strict=True))
         raise InputError(
             f"{place}: keypoints from {spans} are not in the pixels of pictures of {size_px[0]} x {size_px[1]}; "

@@ -110,8 +110,10 @@ DAMAGE = {
     "quaternions are not finite or not of unit length": lambda s: turned(s, *[Gf.Quatf(2, 0, 0, 0)] * 3),
     "does not have one transform per joint": lambda s: turned(s, *[Gf.Quatf(1, 0, 0, 0)] * 2),
     "bindTransforms are no rotations": lambda s: change(skeleton(s).GetBindTransformsAttr(), 2, Gf.Matrix4d(2)),
-    "do not compose to bindTransforms": lambda s: change(skeleton(s).GetRestTransformsAttr(), 2, Gf.Matrix4d(1)),
-    "no root on the ground with a pelvis": lambda s: joints(s, "hips", "hips/spine", "hips/spine/upper_L"),
+    "restTransforms do not compose to bindTransforms": lambda s: change(
+        skeleton(s).GetRestTransformsAttr(), 2, Gf.Matrix4d(1)
+    ),
+    "no root on the ground with a pelvis below it": lambda s: joints(s, "hips", "hips/spine", "hips/spine/upper_L"),
     "does not name its rest pose": lambda s: skeleton(s).GetPrim().SetCustomDataByKey("restPose", ""),
     "its lowest point at rest is at height 0.3 m": floating,
     "skin follows one eye and not the other": one_eye,
@@ -120,11 +122,15 @@ DAMAGE = {
         shape(s, "corrective_01").GetOffsetsAttr().Set([Gf.Vec3f(0)] * 5)
     ),
     "1 blend shapes but 4 targets": lambda s: UsdSkel.BindingAPI(mesh(s)).GetBlendShapesAttr().Set(["smile"]),
-    "frown: point index": lambda s: change(shape(s, "frown").GetPointIndicesAttr(), 0, len(points(s).Get())),
+    "frown: point index out of range": lambda s: change(
+        shape(s, "frown").GetPointIndicesAttr(), 0, len(points(s).Get())
+    ),
     "frown: offsets are not finite or not one a point": short_expression,
-    "are not one a shape from 0 to 1 at time 5": lambda s: change(motion(s).GetBlendShapeWeightsAttr(), 0, -0.5, 5.0),
+    "blend shape weights are not one a shape from 0 to 1 at time 5": lambda s: change(
+        motion(s).GetBlendShapeWeightsAttr(), 0, -0.5, 5.0
+    ),
     "1 display colours for its points": lambda s: mesh(s).GetDisplayColorAttr().Set([Gf.Vec3f(1)]),
-    "Surface: no material is bound": lambda s: UsdShade.MaterialBindingAPI(mesh(s)).UnbindDirectBinding(),
+    "/Avatar/Body/Surface: no material is bound": lambda s: UsdShade.MaterialBindingAPI(mesh(s)).UnbindDirectBinding(),
     "kind is assembly, not component": lambda s: Usd.ModelAPI(s.GetDefaultPrim()).SetKind("assembly"),
     "extentsHint does not contain /Avatar/Body at time": small_hint,
     "has no extentsHint": lambda s: UsdGeom.ModelAPI(s.GetDefaultPrim()).GetExtentsHintAttr().Block(),

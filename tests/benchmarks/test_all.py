@@ -25,7 +25,7 @@ while len((Path(store) / "calls").read_text().split()) < 2:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checkout:
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # it would be found again for another program of the same second
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # else a program rewritten in the same second runs as it was
     return Checkout(tmp_path)
 
 
