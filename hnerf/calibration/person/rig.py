@@ -42,8 +42,8 @@ class _Pair(NamedTuple):
 def first_poses(cameras: Sequence[Camera], keypoints: np.ndarray) -> list[Camera]:
     """Return the cameras, whose intrinsics are known at least roughly, with poses up to a similarity transform.
 
-    keypoints (C, frames, 25, 3) of one person. Raises InputError where they do not link all cameras, or where all
-    cameras look from one direction.
+    keypoints (C, frames, 25, 3) of one person. Raises InputError where they do not link all cameras, whatever pair one
+    starts from, or where all cameras look from one direction.
     """
     pycolmap.logging.minloglevel = 2  # errors only: Ceres otherwise tells of every step that it takes back
     chosen = keypoints[:, evenly_spaced(range(keypoints.shape[1]), START_FRAMES)]
@@ -62,7 +62,14 @@ def first_poses(cameras: Sequence[Camera], keypoints: np.ndarray) -> list[Camera
             "depth; place them around the person"
         )
     starts = sorted(wide, key=lambda ij: wide[ij].agreeing, reverse=True)[:STARTS]
-    rigs = [_add_cameras(cameras, chosen, ij, wide[ij], inlier_px) for ij in starts]
+    rigs, failures = [], []
+    for ij in starts:
+        try:
+            rigs.append(_add_cameras(cameras, chosen, ij, wide[ij], inlier_px))
+        except InputError as error:
+            failures.append(error)
+    if not rigs:
+        raise failures[0]
     return min(rigs, key=lambda rig: trimmed_cost_px(rig, chosen.reshape(len(rig), -1, 3)))
 
 

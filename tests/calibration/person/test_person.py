@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.bundle import align, undistort
+from hnerf.calibration.person import rig
 from hnerf.calibration.person.calibrate import _as_recorded, _each_alone, _motion, calibrate_from_person
 from hnerf.calibration.person.lens import fit_lenses
 from hnerf.calibration.person.rig import first_poses
@@ -47,6 +48,22 @@ def test_a_rig_is_found_without_poses() -> None:
     truth = ring(4)
     found = first_poses([lost(camera) for camera in truth], seen_by(truth, 0.5))
     turn_deg, move_m = worst_errors(found, truth)
+    assert turn_deg < 0.1 and move_m < 0.01
+
+
+def test_a_pair_in_a_wrong_pose_does_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most keypoints seem to fit it, but no other camera fits the points that the two triangulate."""
+    truth, found = ring(4), rig._relative_pose
+
+    def misled(a: Camera, b: Camera, keypoints: np.ndarray, inlier_px: float) -> rig._Pair | None:
+        pair = found(a, b, keypoints, inlier_px)
+        if (a.name, b.name) != ("c0", "c1") or pair is None:
+            return pair
+        first, second = pair.cameras
+        return rig._Pair((first, turned(second, 90, axis=1)), agreeing=10**6, angle_deg=60.0)
+
+    monkeypatch.setattr(rig, "_relative_pose", misled)
+    turn_deg, move_m = worst_errors(first_poses([lost(camera) for camera in truth], seen_by(truth, 0.5)), truth)
     assert turn_deg < 0.1 and move_m < 0.01
 
 
