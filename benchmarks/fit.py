@@ -4,11 +4,13 @@ usage: python benchmarks/fit.py STORE [CAPTURE ...]
 
 Fits by preset `fast` (default: the three rendered captures), reusing what is in STORE. Limb joints are compared by the
 independent program `../shared/accept/score_run.py`; silhouettes of the unclothed body with the true masks, in every
-frame and training camera. Writes `benchmarks/results/fit.json` and `.md`.
+frame and training camera. Part of a joint's error is constant in the joint's own axes: the true skeleton, of another
+character, has the joint elsewhere in the limb. Writes `benchmarks/results/fit.json` and `.md`.
 """
 
 import runpy
 import tempfile
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from provenance import SHARED, provenance, provenance_line, store_and_captures, 
 
 from flows.train_subject import prepare_training, with_detections
 from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import joint_transforms
 from hnerf.config import load_settings
 from hnerf.geometry.silhouette import silhouette
 from tasks.calibration import calibrated_capture
@@ -29,6 +32,8 @@ CAPTURES = ("valid-turn-mono", "valid-walk", "valid-wave")
 COLUMNS = {
     "cameras": ("cameras", "{}"),
     "limb_joint_error_mm": ("limb joints, mm", "{:.1f}"),
+    "constant_mm": ("constant in the joint's axes, mm", "{:.1f}"),
+    "scatter_mm": ("about that, mm", "{:.1f}"),
     "worst_frame_mm": ("worst frame, mm", "{:.0f}"),
     "iou": ("IoU with the true mask", "{:.3f}"),
     "outside_share": ("outside the mask, share of its area", "{:.4f}"),
@@ -58,7 +63,7 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     recording, calibration, _, made = prepare_training(store, recording, settings)
     capture, fit = calibrated_capture(recording, calibration), BodyFit.load(made.root)
-    joints = joint_errors(made, folder)
+    joints = joint_errors(made, fit, folder)
     ious, outside = [], []
     for frame, vertices_m in zip(fit.frames, fit.vertices_m().numpy(), strict=True):
         for name in capture.train_cameras:
@@ -76,12 +81,28 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
     }
 
 
-def joint_errors(made: Artifact, folder: Path) -> dict[str, Any]:
-    """Return the errors of a fit's limb joints by the independent program."""
+def joint_errors(made: Artifact, fit: BodyFit, folder: Path) -> dict[str, Any]:
+    """Return the errors of a fit's limb joints by the independent program, and how far they are constant."""
+    scoring = runpy.run_path(str(SHARED / "accept" / "score_run.py"))
     with tempfile.TemporaryDirectory() as subject:
         (Path(subject) / "fit").symlink_to(made.root)
-        found: dict[str, Any] = runpy.run_path(str(SHARED / "accept" / "score_run.py"))["joints"](Path(subject), folder)
-    return found
+        found: dict[str, Any] = scoring["joints"](Path(subject), folder)
+    truth, sides = np.load(folder / "ground_truth" / "joints.npz"), {"L": "Left", "R": "Right"}
+    pairs = product(scoring["LIMBS"].items(), sides.items())
+    names = [(f"{bone}.{suffix}", f"rig:{side}{joint}") for (bone, joint), (suffix, side) in pairs]
+    ours = [fit.rig.joint_names.index(bone) for bone, _ in names]
+    true_m = truth["positions"][list(fit.frames)][:, [list(truth["names"]).index(joint) for _, joint in names]]
+    placed = joint_transforms(fit.rig, fit.theta, fit.root)[:, ours].numpy()
+    return found | constant_and_scatter(placed[..., :3, :3], placed[..., :3, 3] - true_m)
+
+
+def constant_and_scatter(turns: np.ndarray, errors_m: np.ndarray) -> dict[str, float]:
+    """Split errors (frames, J, 3) of joints with rotations (frames, J, 3, 3): return the mean length of each joint's
+    mean error in its own axes, and the mean distance from it."""
+    own_m = np.einsum("fjdk,fjd->fjk", turns, errors_m)
+    mean_m = own_m.mean(0)
+    lengths_m = np.linalg.norm(mean_m, axis=-1), np.linalg.norm(own_m - mean_m, axis=-1)
+    return {name: 1e3 * float(m.mean()) for name, m in zip(("constant_mm", "scatter_mm"), lengths_m, strict=True)}
 
 
 if __name__ == "__main__":
