@@ -2,19 +2,17 @@
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from hnerf.asset.registration import COSINES
 from hnerf.asset.tangents import frames_at, unit, uv_tangents
 from hnerf.asset.texture import Texels, UvLayout, rasterise, texture_image
 from hnerf.asset.topologies import AssetMesh
 from hnerf.avatar.avatar import Avatar
-from hnerf.avatar.surface import move_onto_surface
+from hnerf.avatar.surface import move_onto_surface, normals_and_distances
 from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig
 
 STEP_M = 0.002  # of differences of the signed distance
-TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 3**0.5  # its corners, as units
 OFF_SURFACE_M = 0.005  # from the field's surface, where its gradient means nothing for the mesh
 
 
@@ -40,12 +38,6 @@ def normal_map(avatar: Avatar, mesh: AssetMesh, layout: UvLayout, side_px: int) 
     return texture_image(texels, (components + 1) / 2, side_px)
 
 
-def gradient_direction(differences_m: Tensor) -> Tensor:
-    """Return the unit gradient (N, 3) of a function of which values (4, N) are known at the corners of a TETRAHEDRON
-    around each point: the sum of the corners, weighted by the values there."""
-    return torch.nn.functional.normalize(differences_m.T @ TETRAHEDRON.to(differences_m), dim=1)
-
-
 @torch.no_grad()
 def _field_normals(avatar: Avatar, rig: Rig, texels: Texels) -> tuple[np.ndarray, np.ndarray]:
     """Return the field's normal at each texel, (N, 3), and its distance there, (N,), in the rest pose, after the mesh
@@ -55,6 +47,5 @@ def _field_normals(avatar: Avatar, rig: Rig, texels: Texels) -> tuple[np.ndarray
     faces = rig.faces.to(device)
     surface_m, _ = move_onto_surface(avatar, rig.vertices_m.to(device), faces, theta, root)
     points_m = (surface_m[faces[texels.face.to(device)]] * texels.barycentric.to(device)[..., None]).sum(1)
-    around = [avatar.signed_distance(points_m + STEP_M * corner, theta, root) for corner in TETRAHEDRON.to(points_m)]
-    values_m = torch.stack(around)
-    return gradient_direction(values_m).double().cpu().numpy(), values_m.mean(0).double().cpu().numpy()
+    normals, distances_m = normals_and_distances(avatar, points_m, theta, root, STEP_M)
+    return normals.double().cpu().numpy(), distances_m.double().cpu().numpy()

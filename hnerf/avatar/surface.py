@@ -21,6 +21,7 @@ POSED_CELLS = 256  # on the longest side of the box
 MAX_STEP_M = 0.03  # skinning error stays below this; a longer distance belongs to another limb
 POSED_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
 NO_SURFACE = "signed distance field: "  # begins every reason why a field has no surface
+TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 3**0.5  # its corners, as units
 
 
 def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
@@ -52,6 +53,17 @@ def step_to_surface(distance_m: Tensor) -> Tensor:
     """Return the distances (V,) to step back along the normal: all of them up to half of MAX_STEP_M, and less beyond,
     down to 0 where the zero surface belongs to another limb."""
     return distance_m * (2 - 2 * distance_m.abs() / MAX_STEP_M).clamp(0, 1)
+
+
+def normals_and_distances(
+    avatar: Avatar, points_m: Tensor, theta: Tensor, root: Tensor, step_m: float
+) -> tuple[Tensor, Tensor]:
+    """Return the unit gradient (N, 3) of the avatar's signed distance at points (N, 3), and the distance (N,), from its
+    values at the corners of a tetrahedron, `step_m` from each point: the sum of the corners, weighted by the values
+    there, and the mean of the values."""
+    corners = TETRAHEDRON.to(points_m)
+    values_m = torch.stack([avatar.signed_distance(points_m + step_m * corner, theta, root) for corner in corners])
+    return torch.nn.functional.normalize(values_m.T @ corners, dim=1), values_m.mean(0)
 
 
 def extract_surface(

@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from hnerf.avatar.avatar import Avatar, Rendering
-from hnerf.avatar.surface import posed_surface
+from hnerf.avatar.surface import normals_and_distances, posed_surface
 from hnerf.capture.capture import read_rgb, write_image
 from hnerf.capture.footage import Video
 from hnerf.geometry.camera import Camera
@@ -21,8 +21,7 @@ from hnerf.progress import tracked
 
 COVERED = 0.5  # alpha from which a pixel has a depth and a normal
 NEAR_GREY, FAR_GREY = 255, 64  # grey levels at the ends of a depth video's range
-NORMAL_STEP_M = 0.003  # of finite differences of the signed distance
-TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
+NORMAL_STEP_M = 0.005  # of differences of the signed distance
 Shot = tuple[Camera, int]  # a camera, and the frame of avatar.body whose pose is shown
 
 
@@ -90,14 +89,12 @@ def depth_image(rendering: Rendering, camera: Camera) -> Tensor:
 @torch.no_grad()
 def normal_image(avatar: Avatar, rendering: Rendering, camera: Camera, theta: Tensor, root: Tensor) -> Tensor:
     """Return surface normals as an image (H, W, 3) uint8, encoded as in `write_pictures`: the gradient of the signed
-    distance where rays end, by finite differences at the corners of a tetrahedron."""
-    covered = rendering.alpha > COVERED
+    distance where rays end."""
+    covered = (rendering.alpha > COVERED) & (rendering.depth_m > 0)  # a mixed pixel's centre may pass the person
     origins, directions = (torch.from_numpy(a.copy()).to(rendering.depth_m) for a in camera.rays(camera.pixels_px))
     points_m = origins[covered] + rendering.depth_m[covered][:, None] * directions[covered]
-    corners = torch.tensor(TETRAHEDRON).to(points_m)
-    around_m = (points_m + NORMAL_STEP_M * corners[:, None]).flatten(0, 1)  # (4 N, 3)
-    distances_m = avatar.signed_distance(around_m, theta, root).view(len(corners), -1)
-    seen = torch.nn.functional.normalize(distances_m.T @ corners, dim=-1) @ torch.from_numpy(camera.R.T).to(points_m)
+    normals, _ = normals_and_distances(avatar, points_m, theta, root, NORMAL_STEP_M)
+    seen = normals @ torch.from_numpy(camera.R.T).to(points_m)
     image = torch.zeros(*covered.shape, 3, dtype=torch.uint8, device=covered.device)
     image[covered] = (127.5 * (seen * seen.new_tensor([1, -1, -1]) + 1)).round().to(torch.uint8)
     return image

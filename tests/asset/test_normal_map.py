@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hnerf.asset.correctives import as_they_are
-from hnerf.asset.normal_map import gradient_direction, normal_map
+from hnerf.asset.normal_map import normal_map
 from hnerf.asset.texture import UvLayout
 from hnerf.asset.topologies import AssetMesh
 from hnerf.body.base_mesh import BaseMesh
@@ -80,9 +80,3 @@ def test_half_of_the_trust_is_halfway() -> None:
     # length (0.316, 0, 0.949).
     found = map_of((0.6, 0, 0.8), CORNERS, 0.0125)
     np.testing.assert_allclose(found, np.broadcast_to((168, 128, 248), found.shape), atol=1)
-
-
-def test_gradient_from_the_corners_of_a_tetrahedron() -> None:
-    # Along z the corners are (1, -1, -1, 1) / 3^(1/2), along y (1, -1, 1, -1) / 3^(1/2).
-    values = torch.tensor([[1.0, 6 + 7], [-1, 6 - 7], [-1, 6 - 1], [1, 6 + 1]])  # z, and 6 + 3 y + 4 z
-    torch.testing.assert_close(gradient_direction(values), torch.tensor([[0, 0, 1], [0, 0.6, 0.8]]))

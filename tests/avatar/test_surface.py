@@ -8,7 +8,7 @@ import trimesh
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from hnerf.avatar.surface import _largest_component, extract_surface, surface_in_pose
+from hnerf.avatar.surface import _largest_component, extract_surface, normals_and_distances, surface_in_pose
 from hnerf.errors import InputError
 from tests.body.boxes import box_rig
 
@@ -76,3 +76,23 @@ def test_clothes_18_cm_off_the_body_are_meshed() -> None:
 def test_a_field_without_a_closed_surface_is_refused(offset_m: float, message: str) -> None:
     with pytest.raises(InputError, match=message):
         extract_surface(lambda p: sphere(p) + offset_m, LOWER_M, UPPER_M, 32)
+
+
+def test_normals_and_distances_by_hand() -> None:
+    """Of 6 + 3 y + 4 z at (1, 2, 3), and of the squared distance from the origin at (0, 0, 2): half a metre around it,
+    in four directions that cancel out, that is 2^2 + (1/2)^2 on average."""
+
+    def plane(points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        return 6 + points_m @ torch.tensor([0.0, 3, 4])
+
+    def square(points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        return points_m.square().sum(1)
+
+    pose = torch.zeros(1, 3), torch.eye(4)
+    for function, point_m, normal, distance_m in (
+        (plane, [1.0, 2, 3], [0, 0.6, 0.8], 24.0),
+        (square, [0.0, 0, 2], [0.0, 0, 1], 4.25),
+    ):
+        avatar: Any = SimpleNamespace(signed_distance=function)
+        found = normals_and_distances(avatar, torch.tensor([point_m]), *pose, 0.5)
+        torch.testing.assert_close(found, (torch.tensor([normal]), torch.tensor([distance_m])))

@@ -62,6 +62,16 @@ def test_normals_of_a_ball_point_away_from_its_middle() -> None:
     assert (image[~seen(CAMERA, centre_m(0))] == 0).all()
 
 
+def test_a_pixel_whose_centre_passes_the_person_has_no_normal() -> None:
+    """Three of its quarters are covered, so it has an alpha of .75 and, being its centre's, no depth."""
+    ball = SolidBall(ball_fit())
+    alpha, depth_m = torch.zeros(SIZE_PX, SIZE_PX), torch.zeros(SIZE_PX, SIZE_PX)
+    alpha[28, 40] = 0.75
+    rendering = Rendering(torch.zeros(SIZE_PX, SIZE_PX, 3), alpha, depth_m)
+    assert not depth_image(rendering, CAMERA).any()
+    assert not normal_image(ball, rendering, CAMERA, ball.body.theta[0], ball.body.root[0]).any()
+
+
 def test_every_kind_is_written_for_every_shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hnerf.avatar.surface.POSED_CELLS", 48)
     ball = SolidBall(ball_fit())
