@@ -3,8 +3,8 @@
 `python -m hnerf.results FOLDER` writes a JSON schema of each file, as in docs/schemas/.
 """
 
+import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any, Literal, NotRequired
 
@@ -237,5 +237,12 @@ def write_schemas(folder: Path) -> None:
         (folder / f"{name}.json").write_text(json.dumps(_closed(kind).json_schema(), indent=1) + "\n")
 
 
+def main(argv: list[str] | None = None) -> None:
+    """Write the schemas into the folder that the command line names."""
+    parser = argparse.ArgumentParser(prog="python -m hnerf.results", description="Write a JSON schema of each result.")
+    parser.add_argument("folder", type=Path, help="where to, like docs/schemas")
+    write_schemas(parser.parse_args(argv).folder)
+
+
 if __name__ == "__main__":
-    write_schemas(Path(sys.argv[1]))
+    main()

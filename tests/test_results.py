@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from hnerf.results import FILES, HeldOutCamera, write_result, write_schemas
+from hnerf.results import FILES, HeldOutCamera, main, write_result, write_schemas
 
 SCHEMAS = Path(__file__).parent.parent / "docs" / "schemas"
 MEANS: dict[str, Any] = dict.fromkeys(["psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr"])
@@ -36,3 +36,20 @@ def test_the_committed_schemas_are_fresh(tmp_path: Path) -> None:
     assert {path.stem for path in SCHEMAS.iterdir()} == set(FILES)
     for path in SCHEMAS.iterdir():
         assert path.read_text() == (tmp_path / path.name).read_text(), path.name
+
+
+@pytest.mark.parametrize(("given", "status"), [(["--help"], 0), ([], 2), (["a", "b"], 2), (["--folder"], 2)])
+def test_the_program_writes_into_one_folder_only(
+    given: list[str], status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(given)
+    assert ended.value.code == status
+    assert "usage: python -m hnerf.results" in "".join(capsys.readouterr())
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_program_writes_all_schemas(tmp_path: Path) -> None:
+    main([str(tmp_path / "schemas")])
+    assert {path.stem for path in (tmp_path / "schemas").iterdir()} == set(FILES)
