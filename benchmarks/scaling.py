@@ -8,6 +8,7 @@ its frames, cameras and pixels in turn, in a new store. Writes `benchmarks/resul
 straight lines of the chart mark proportional cost.
 """
 
+import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -36,6 +37,7 @@ STEPS = 60
 SHARES = (0.25, 0.5)
 MARKERS = "os^Dv"
 Cost = tuple[float, float]  # seconds, GiB
+Part = tuple[Artifact, tuple[str, ...] | None, tuple[int, ...] | None]  # of a recording: training cameras and frames
 
 
 def main() -> None:
@@ -61,26 +63,30 @@ def main() -> None:
 
 def measure_parts(capture: Path, scratch: Path) -> dict[str, dict[int, dict[str, Cost]]]:
     """Return the costs by axis, amount and stage; the largest amount of each axis is the whole capture."""
-    store = Store(scratch / "captures")
+    store = Store(scratch / "store")
     recording = ingest(store, read_capture(capture)[0], load_settings("fast").capture)
     recorded = Capture.load(recording.root)
     frames, cameras = recorded.train_frames, recorded.train_cameras
-    pixels = recorded.cameras[cameras[0]].width_px * recorded.cameras[cameras[0]].height_px
-    costs: dict[str, dict[int, dict[str, Cost]]] = {"frames": {}, "cameras": {}, "pixels": {}}
-    for amount in parts_of(len(frames)):
-        part = subset_capture(store, recording, None, tuple(evenly_spaced(frames, amount)), ())
-        costs["frames"][amount] = measure(Store(scratch / f"frames-{amount}"), part)
-    for amount in parts_of(len(cameras)):
-        part = subset_capture(store, recording, tuple(evenly_spaced(cameras, amount)), None, ())
-        costs["cameras"][amount] = measure(Store(scratch / f"cameras-{amount}"), part)
-    for share in SHARES:
-        smaller = degrade_capture(store, recording, Degradation(kind="small_images", strength=share**0.5, seed=0))
-        part = subset_capture(store, smaller, None, None, ())
-        costs["pixels"][round(share * pixels)] = measure(Store(scratch / f"pixels-{share:g}"), part)
-    whole = measure(Store(scratch / "whole"), subset_capture(store, recording, None, None, ()))
-    for axis, amount in {"frames": len(frames), "cameras": len(cameras), "pixels": pixels}.items():
-        costs[axis][amount] = whole
-    return costs
+    shrunk = [Degradation(kind="small_images", strength=share**0.5, seed=0) for share in SHARES]
+    smaller = [degrade_capture(store, recording, degradation) for degradation in shrunk]
+    parts: dict[str, dict[int, Part]] = {
+        "frames": {n: (recording, None, tuple(evenly_spaced(frames, n))) for n in parts_of(len(frames))},
+        "cameras": {n: (recording, tuple(evenly_spaced(cameras, n)), None) for n in parts_of(len(cameras))},
+        "pixels": {pixels_of(images): (images, None, None) for images in smaller},
+    }
+    costs = {
+        axis: {amount: measure(store, subset_capture(store, *part, ())) for amount, part in by_amount.items()}
+        for axis, by_amount in parts.items()
+    }
+    whole = measure(store, subset_capture(store, recording, None, None, ()))  # last: its memory would stay allocated
+    amounts = {"frames": len(frames), "cameras": len(cameras), "pixels": pixels_of(recording)}
+    return {axis: rows | {amounts[axis]: whole} for axis, rows in costs.items()}
+
+
+def pixels_of(recording: Artifact) -> int:
+    """Return the pixels of an image of the first training camera."""
+    capture = Capture.load(recording.root)
+    return math.prod(capture.cameras[capture.train_cameras[0]].size_px)
 
 
 def parts_of(whole: int) -> list[int]:
