@@ -1,5 +1,6 @@
 """Studies as files, and the parts of a capture that their variants name."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 from hnerf.config import load_settings
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import STUDIES, BenchmarkStudy, Variant, load_study, snapshot_times_s
+from tests.shared_data import SHARED_DATA
 
 RECORDED: Any = SimpleNamespace(name="ada", train_cameras=("a", "b", "c", "d"), train_frames=(0, 2, 4, 6, 8))
 
@@ -30,6 +32,19 @@ def test_studies_that_are_promised_are_there_and_valid() -> None:
     assert studies["quick"].variants["one frame"].methods == ("fast", "nerf")
     assert [v.cameras for v in studies["cameras"].variants.values()] == [2, 4, 8, 16, 32]
     assert [v.frames for v in studies["frames"].variants.values()] == [1, 5, 10, 20, 40]
+
+
+def test_claims_are_sentences_of_the_paper_or_parts_of_one() -> None:
+    """Its parentheses are left out, an ellipsis stands for words, and a quote may begin and end within a sentence."""
+    paper = SHARED_DATA.parent / "reference" / "h-nerf-paper.tex"
+    if not paper.exists():
+        pytest.skip("the paper is not beside this checkout")
+    plain = re.sub(r"\\cite\{[^}]*\}|\([^)]*\)|[~\\]", " ", paper.read_text())
+    sentences = [" ".join(sentence.split()).lower() for sentence in re.split(r"(?<=[.:])\s+(?=[A-Z])", plain)]
+    for path in STUDIES.glob("*.yaml"):
+        for claim in load_study(path.stem).claims:
+            parts = [part.strip(" .").lower() for part in claim.says.split("...")]
+            assert any(all(part in sentence for part in parts) for sentence in sentences), claim.says
 
 
 def test_methods_of_ready_studies_have_valid_settings() -> None:
