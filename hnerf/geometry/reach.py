@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from hnerf.geometry.camera import Camera
 
 NEAREST_PERCENT = 1  # percentile of vertex depths that sets the radius: one finger does not widen all discs
-FARTHEST_PX = 1e5  # corners are clipped to it, as OpenCV fills polygons of small integers
+FARTHEST_PX = 1e5  # of a corner, as OpenCV fills polygons of small integers
 ReachablePixels = Callable[[Camera, Float[np.ndarray, "V 3"]], Bool[np.ndarray, "H W"]]
 """Returns which pixels of a camera can show any part of a body with these vertices."""
 
@@ -22,13 +22,13 @@ def everywhere(camera: Camera, vertices_m: Float[np.ndarray, "V 3"]) -> Bool[np.
 
 def within_box(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], margin_m: float) -> Bool[np.ndarray, "H W"]:
     """Return the pixels whose rays meet the bounding box of the body with a margin; all pixels if part of the box lies
-    behind the camera."""
+    behind the camera, or all but touches its plane."""
     lower_m, upper_m = vertices_m.min(0) - margin_m, vertices_m.max(0) + margin_m
     corners_px, depth_m = camera.project(np.array(list(itertools.product(*zip(lower_m, upper_m, strict=True)))))
-    if depth_m.min() <= 0:
+    if depth_m.min() <= 0 or np.abs(corners_px).max() > FARTHEST_PX:
         return everywhere(camera, vertices_m)
     met = np.zeros((camera.height_px, camera.width_px), np.uint8)
-    outline = cv2.convexHull(corners_px.clip(-FARTHEST_PX, FARTHEST_PX).round().astype(np.int32))
+    outline = cv2.convexHull(corners_px.round().astype(np.int32))
     return cv2.fillConvexPoly(met, outline, 1) > 0
 
 

@@ -214,6 +214,12 @@ def test_a_box_around_the_camera_is_met_everywhere():
     assert np.array_equal(everywhere(AHEAD, vertices_m), np.ones((40, 60), bool))
 
 
+def test_a_box_that_all_but_touches_the_camera_is_met_where_it_is() -> None:
+    """From 10 um to 2 m ahead, .2 to 1 m to the right and .02 to 1 m down: the ray through (55, 3) is at (1.1 z, .06 z)
+    and enters it at z = 1/3. Its near corners are up to 5 000 000 px away."""
+    assert within_box(AHEAD, np.array([[0.4, 0.22, 0.20001], [0.8, 0.8, 1.8]]), 0.2)[3, 55]
+
+
 def test_a_box_beside_the_image_is_not_met():
     assert not within_box(AHEAD, np.array([[-3.0, 0.0, 2.0], [-1.0, 1.0, 2.5]]), 0.2).any()
 
