@@ -3,7 +3,7 @@
 usage: python benchmarks/fingerprints.py OUT.json [--scratch DIR]
 
 Runs the pipeline from scratch on one thread with seed 0: the demo, `valid-wave` for 100 steps where `../shared` lies
-beside this checkout, `paper-small` on one frame for 10 steps and each compared method for 20. Writes SHA-256 of the
+beside this checkout, `paper-small` on one frame for 10 steps and each compared method for 20. Writes a digest of the
 numbers in each run's masks, body, model and metrics (but seconds); names and layouts of files do not count. Takes some
 ten minutes. Compare two files with `diff`.
 """
@@ -87,7 +87,7 @@ def call(*arguments: str, may_fail: bool = False) -> None:
 
 
 def fingerprint(subject: Path) -> dict[str, str]:
-    """Return a SHA-256 for each stage that has output."""
+    """Return a digest for each stage that has output."""
     found = {}
     masks = sorted(subject.glob("segmentation/**/*.png"))
     found["masks"] = digest(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in masks)
@@ -118,7 +118,7 @@ def numbers(value: Any) -> Iterator[float]:
 
 
 def digest(arrays: Any) -> str:
-    """Return the SHA-256 of the arrays' bytes."""
+    """Return the first 16 digits of the SHA-256 of the arrays' bytes."""
     total = hashlib.sha256()
     for array in arrays:
         total.update(np.ascontiguousarray(array).tobytes())

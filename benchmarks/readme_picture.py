@@ -3,12 +3,12 @@
 usage: python benchmarks/readme_picture.py SUBJECT_DIR [--camera NAME] [--frame N] [--out docs/valid-wave.png]
 """
 
-import argparse
 from pathlib import Path
 
 import cv2
 import numpy as np
 import trimesh
+from provenance import arguments
 
 from hnerf.avatar.surface import posed_surface
 from hnerf.avatar.trained import load_avatar
@@ -21,7 +21,7 @@ from hnerf.geometry.mesh_queries import Surface
 
 def main() -> None:
     """Write the picture."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = arguments(__doc__)
     parser.add_argument("subject", type=Path)
     parser.add_argument("--camera", default="05")
     parser.add_argument("--frame", type=int, default=0)

@@ -64,9 +64,7 @@ def measure(folder: Path, sheet: Path | None) -> dict[str, Any]:
         found = {"clean plate": [_timed_segment(capture, None)]}
         shutil.rmtree(capture.root / "background")
         found["no plate"] = _rounds(capture)
-        figures: dict[str, Any] = {
-            "size_px": list(capture.image(capture.train_cameras[0], capture.frames[0]).shape[:2])
-        }
+        figures: dict[str, Any] = {"size_px": list(capture.cameras[capture.train_cameras[0]].size_px)}
         for kind, rounds in found.items():
             masks = rounds[-1][0]
             figures[kind] = score(folder, capture, masks) | {
