@@ -73,7 +73,7 @@ KINDS = {
     ),
     "image_noise": DegradationKind("capture", "image noise, levels of 255", degraded_images.add_noise),
     "image_blur": DegradationKind("capture", "blur, % of image width", degraded_images.blur),
-    "exposure": DegradationKind("capture", "exposure between cameras, ± stops", degraded_images.vary_exposure),
+    "exposure": DegradationKind("capture", "exposure of cameras, values times 2^±x", degraded_images.vary_exposure),
     "small_images": DegradationKind("capture", "image size, share", degraded_images.resize, 1, 0),
     "large_images": DegradationKind("capture", "image size, multiple", degraded_images.resize, 1),
     "occluder": DegradationKind("capture", "pillar in front, width in m", occluder.add_pillar),

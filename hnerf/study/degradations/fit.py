@@ -11,7 +11,8 @@ from hnerf.body.fit_result import BodyFit
 
 
 def add_pose_noise(body: BodyFit, angle_deg: float, rng: np.random.Generator) -> BodyFit:
-    """Rotate every free joint of every frame at random; `angle_deg` is the root mean square of the added rotations."""
+    """Add random vectors to the rotation vectors of all free joints of all frames; `angle_deg` is the root mean square
+    of their lengths, and of the turns where joints are straight."""
     return dataclasses.replace(body, theta=body.theta + _rotation_noise(body, len(body.frames), angle_deg, rng))
 
 
@@ -28,7 +29,7 @@ def change_shape(body: BodyFit, distance_mm: float, rng: np.random.Generator) ->
 def extreme_poses(body: BodyFit, angle_deg: float, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Return poses far from those of the body's frames: theta (count, J, 3) and root (count, 4, 4).
 
-    Frames are drawn at random, and every free joint is rotated at random by `angle_deg` (root mean square).
+    Frames are drawn at random, and every free joint is turned as by `add_pose_noise`.
     """
     rows = torch.from_numpy(rng.integers(len(body.frames), size=count))
     return body.theta[rows] + _rotation_noise(body, count, angle_deg, rng), body.root[rows]

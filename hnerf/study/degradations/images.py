@@ -27,12 +27,12 @@ def blur(capture: Capture, percent: float, rng: np.random.Generator, out: Path) 
     rewrite_images(capture, out, lambda _, rgb: cv2.GaussianBlur(rgb, (0, 0), percent / 100 * rgb.shape[1]))
 
 
-def vary_exposure(capture: Capture, stops: float, rng: np.random.Generator, out: Path) -> None:
-    """Multiply training cameras' images by gains from 2^-stops to 2^stops, evenly spaced in stops and assigned at
-    random."""
+def vary_exposure(capture: Capture, power: float, rng: np.random.Generator, out: Path) -> None:
+    """Multiply the encoded values of training cameras' images by gains from 2^-power to 2^power, evenly spaced in the
+    exponent and assigned at random. A gain of 2 is that of 2.2 stops of light, by sRGB's gamma."""
     require_several_cameras(capture)
     names = rng.permutation(capture.train_cameras)
-    gains = dict(zip(names.tolist(), 2 ** np.linspace(-stops, stops, len(names)), strict=True))
+    gains = dict(zip(names.tolist(), 2 ** np.linspace(-power, power, len(names)), strict=True))
     rewrite_images(capture, out, lambda camera, rgb: _to_8_bit(rgb * gains[camera]))
 
 
