@@ -84,8 +84,9 @@ def select_frames(frames: tuple[int, ...], wanted: str, source: Path) -> tuple[i
 
 def select_poses(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
     """Return the body with the poses of these frames only."""
-    index = [body.index(frame) for frame in frames]
-    return dataclasses.replace(body, frames=frames, theta=body.theta[index], root=body.root[index])
+    rows = {frame: row for row, frame in enumerate(body.frames)}  # `body.index` would look through all for each
+    chosen = [rows[frame] for frame in frames]
+    return dataclasses.replace(body, frames=frames, theta=body.theta[chosen], root=body.root[chosen])
 
 
 def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:

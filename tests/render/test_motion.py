@@ -1,6 +1,7 @@
 import dataclasses
 import math
 import os
+import time
 import zipfile
 from pathlib import Path
 
@@ -163,6 +164,18 @@ def test_frames_that_are_not_there_are_refused(wanted: str, message: str) -> Non
 def test_rows_are_found_by_frame() -> None:
     body = bending_body()
     torch.testing.assert_close(select_poses(body, (5, 8)).theta, body.theta[2:])
+
+
+def test_poses_of_a_long_motion_are_selected_in_one_pass() -> None:
+    """Looking each frame up among 60 000 would be 1.8 thousand million comparisons, more than half a minute."""
+    count = 60_000
+    body = BodyFit(
+        column_rig(), tuple(range(count)), torch.arange(count).view(-1, 1, 1).float(), torch.zeros(count, 4, 4)
+    )
+    began = time.perf_counter()
+    chosen = select_poses(body, body.frames[::-1])
+    assert time.perf_counter() - began < 5
+    assert chosen.theta[:2].flatten().tolist() == [count - 1, count - 2]
 
 
 def test_the_fit_of_another_subject_is_read_with_its_rate(tmp_path: Path) -> None:
