@@ -51,8 +51,8 @@ class NerfField(StaticField):
     Simplified: both terms are absolute errors, as for all compared methods, not squared ones; as many fine samples as
     coarse ones (64 and 128 in the paper); smaller networks, so that minutes on two CPU cores are meaningful (8 layers
     as published, `width` 256 in the paper); Swish as in H-NeRF instead of ReLU, which took several times as many steps
-    to leave an empty box; softplus instead of ReLU for the density, which cannot die; rays end with the person's box,
-    in front of the clean plate.
+    to leave an empty box; softplus instead of ReLU for the density, which cannot die; without the linear layer
+    between trunk and view, which the next one absorbs; rays end with the person's box, in front of the clean plate.
     """
 
     def __init__(self, body: BodyFit, settings: NerfSettings):
