@@ -13,8 +13,8 @@ Gains = dict[str, tuple[float, float, float]]  # exposure of red, green and blue
 
 @dataclass(frozen=True)
 class Rendering:
-    """One image over black: rgb (H, W, 3) in [0, 1], premultiplied by alpha (H, W); depth_m (H, W), 0 where alpha is
-    0."""
+    """One image over black: rgb (H, W, 3) in [0, 1], premultiplied by alpha (H, W); depth_m (H, W) along the ray
+    through the pixel's centre, 0 where it meets nobody."""
 
     rgb: Tensor
     alpha: Tensor
