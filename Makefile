@@ -1,4 +1,4 @@
-# make install | test | soak | demo | docs.  pip's own environment variables choose another index, for example for CUDA wheels.
+# make install | test | faults | soak | demo | docs.  pip's own environment variables choose another index, for example for CUDA wheels.
 export DO_NOT_TRACK := 1
 
 PYTHON ?= python3
@@ -6,7 +6,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 SUBJECTS ?= 6
 
-.PHONY: install test soak demo docs
+.PHONY: install test faults soak demo docs
 
 install: $(INSTALLED)
 
@@ -25,6 +25,9 @@ test: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check --quiet .
 	env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist worksteal
+
+faults: $(INSTALLED)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/faults.py
 
 soak: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m soak
