@@ -9,7 +9,7 @@ from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas import filters
 from prefect.client.schemas.objects import FlowRun, State, StateType
 from prefect.client.schemas.sorting import FlowRunSort
-from prefect.states import Scheduled
+from prefect.states import Failed, Scheduled
 
 FLOW, NAME = "train-subject", "local"
 DEPLOYMENT = f"{FLOW}/{NAME}"
@@ -30,11 +30,12 @@ def unfinished_runs() -> int:
         return client.count_flow_runs(**_filters(*UNFINISHED))
 
 
-def restart_crashed(max_restarts: int) -> int:
-    """Put crashed runs of the deployment, those whose machine or process was lost, back into the queue; return how
-    many. Each is begun no more than `max_restarts` times again, because the run itself may be what ends the process,
-    even before the server counts it as running. It begins after RELEASE."""
-    restarted = 0
+def restart_crashed(max_restarts: int) -> list[tuple[FlowRun, str]]:
+    """Put crashed runs of the deployment, those whose machine or process was lost, back into the queue. Each is begun
+    no more than `max_restarts` times again, because the run itself may be what ends the process, even before the server
+    counts it as running. It begins after RELEASE. If it crashes once more, it becomes failed: return these runs, with
+    the reason."""
+    given_up = []
     with get_client(sync_client=True) as client:
         for run in _all_runs(client, StateType.CRASHED):
             before = [state.message == AGAIN for state in client.read_flow_run_states(run.id)].count(True)
@@ -42,8 +43,13 @@ def restart_crashed(max_restarts: int) -> int:
                 again: State[None] = Scheduled(scheduled_time=datetime.now(UTC) + RELEASE, message=AGAIN)
                 client.set_flow_run_state(run.id, again, force=True)
                 log.warning("%s crashed and is begun again, %d of %d times", run.name, before + 1, max_restarts)
-                restarted += 1
-    return restarted
+            else:
+                lost = f"its process or machine was lost {before + 1} times; the run itself may end it"
+                failed: State[None] = Failed(message=lost)
+                client.set_flow_run_state(run.id, failed, force=True)
+                log.error("%s failed: %s", run.name, lost)
+                given_up.append((run, lost))
+    return given_up
 
 
 def _all_runs(client: SyncPrefectClient, *states: StateType) -> list[FlowRun]:

@@ -89,18 +89,20 @@ def test_values_out_of_range_are_refused_before_there_is_a_run(deployed: str) ->
         run_deployment("ingest-captures/local", parameters={"folder": "captures", "max_unfinished": 0}, timeout=0)
 
 
-def test_a_crashed_run_is_begun_again_a_few_times(deployed: str) -> None:
+def test_a_crashed_run_is_begun_again_a_few_times_and_then_fails(deployed: str) -> None:
     run = run_deployment("train-subject/local", parameters={"capture": "/recordings/bob"}, timeout=0)
-    counts = []
     with get_client(sync_client=True) as client:
-        for _ in range(4):
+        for _ in range(2):
             client.set_flow_run_state(run.id, Crashed(), force=True)  # type: ignore[union-attr]
-            counts.append(restart_crashed(max_restarts=2))
-            if counts[-1]:
-                begins = client.read_flow_run(run.id).next_scheduled_start_time  # type: ignore[union-attr]
-                assert begins and begins > datetime.now(UTC) + RELEASE / 2
-        assert counts == [1, 1, 0, 0]
-        assert client.read_flow_run(run.id).state_name == "Crashed"  # type: ignore[union-attr]
+            assert restart_crashed(max_restarts=2) == []
+            begins = client.read_flow_run(run.id).next_scheduled_start_time  # type: ignore[union-attr]
+            assert begins and begins > datetime.now(UTC) + RELEASE / 2
+        client.set_flow_run_state(run.id, Crashed(), force=True)  # type: ignore[union-attr]
+        ((lost, why),) = restart_crashed(max_restarts=2)
+        state = client.read_flow_run(run.id).state  # type: ignore[union-attr]
+        assert lost.id == run.id and state and (state.name, state.message) == ("Failed", why)  # type: ignore[union-attr]
+        assert why.startswith("its process or machine was lost 3 times")
+        assert restart_crashed(max_restarts=2) == []
 
 
 def test_more_runs_than_the_server_gives_at_once_are_all_counted(

@@ -40,7 +40,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
     monkeypatch.setattr(module, "run_deployment", run_deployment)
     monkeypatch.setattr(module, "unfinished_runs", lambda: 0)
-    monkeypatch.setattr(module, "restart_crashed", lambda _: 0)
+    monkeypatch.setattr(module, "restart_crashed", lambda _: [])
     return asked
 
 
@@ -185,6 +185,20 @@ def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> N
     (watched / ".refused" / "ada.txt").symlink_to(tmp_path / "elsewhere" / "file")
     quarantine.note(watched / "ada", "refused: y")
     assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_a_run_that_was_lost_too_often_is_noted_where_it_was_started_from(
+    watched: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look(watched)
+    elsewhere = watched.parent / "elsewhere" / "ada"
+    elsewhere.mkdir(parents=True)
+    lost = [SimpleNamespace(name="ada", id="1", parameters={"capture": str(c)}) for c in (watched / "ada", elsewhere)]
+    monkeypatch.setattr(module, "restart_crashed", lambda _: [(run, "lost 4 times") for run in lost])
+    look(watched)
+    assert (watched / ".refused" / "ada.txt").read_text().startswith("ada: failed: lost 4 times (flow run ada, 1)\n")
+    assert [path.name for path in watched.glob(".refused/*")] == ["ada.txt"]
+    assert list(elsewhere.parent.iterdir()) == [elsewhere]  # it was not started from a watched folder
 
 
 def test_a_run_that_fails_is_noted_where_it_was_started_from(watched: Path, prefect_api: str) -> None:
