@@ -17,6 +17,7 @@ import pytest
 import torch
 import trimesh
 
+from hnerf.capture.capture import Capture
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import evaluate as module
 from hnerf.evaluation.evaluate import PROTOCOL, evaluate, mesh_frames, protocol_of, reason_without_surface
@@ -121,10 +122,7 @@ def test_few_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> N
     (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
     for frame in (0, 2):
         (capture.root / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
-    out = tmp_path / "evaluation"
-    out.mkdir()
-    settings = EvaluationSettings(max_images=2, max_meshes=1, report_rows=1)
-    found = evaluate(ball_inputs(capture, tmp_path / "stages"), settings, out)
+    _, found = evaluated(tmp_path, capture, max_images=2)
     assert [row["frame"] for row in found["novel_view"]["per_image"]] == [1]
 
 
@@ -228,18 +226,15 @@ def test_the_report_shows_all_three_side_by_side(scored: Scored) -> None:
     assert "not trained on, in poses as fitted before training" in text
 
 
-def evaluated(base: Path, test_cameras: tuple[str, ...], truth: bool, kind: str) -> tuple[Path, dict[str, Any]]:
+def evaluated(base: Path, capture: Capture, kind: str = "fast", **settings: Any) -> Scored:
     """Evaluate a ball without a report; return the folder and what was found."""
-    capture = write_ball_capture(base / "capture", "ball", test_cameras)
-    if truth:
-        write_ball_truth(capture, RADIUS_M)
     inputs = ball_inputs(capture, base / "stages")
     write_settings(inputs.training_folder, kind)
     out = base / "evaluation"
     out.mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "write_report", lambda *_: None)
-        return out, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1), out)
+        return out, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1, **settings), out)
 
 
 class Mist(BallAvatar):
@@ -270,7 +265,7 @@ def test_a_surface_without_truth_is_a_surface(unscored: Scored) -> None:
 
 
 def test_a_method_that_tunes_nothing_has_one_column(tmp_path: Path) -> None:
-    out, found = evaluated(tmp_path, ("c",), False, "neural_body")
+    out, found = evaluated(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "neural_body")
     assert found["novel_pose_posed"]["reason"] == "no pose of these frames was tuned"
     assert found["novel_pose_tracked"]["reason"] == "these frames have no deformation of their own"
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_pose", "novel_view", "training_view"]
@@ -318,7 +313,7 @@ def test_masks_of_training_cameras_score_nothing(tmp_path: Path) -> None:
 
 
 def test_a_method_without_poses_shows_no_new_ones(tmp_path: Path) -> None:
-    out, found = evaluated(tmp_path, ("c",), False, "nerfies")
+    out, found = evaluated(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "nerfies")
     assert "Nerfies has no pose to set" in found["novel_pose"]["reason"]
     assert "Nerfies has no pose to set" in found["novel_pose"]["geometry_reason"]
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_view", "training_view"]
@@ -327,7 +322,9 @@ def test_a_method_without_poses_shows_no_new_ones(tmp_path: Path) -> None:
 
 def test_nothing_is_scored_on_pixels_of_training_cameras(tmp_path: Path) -> None:
     """Give the truth of every image."""
-    out, found = evaluated(tmp_path, (), True, "fast")
+    capture = write_ball_capture(tmp_path / "capture", "ball", ())
+    write_ball_truth(capture, RADIUS_M)
+    out, found = evaluated(tmp_path, capture)
     for split in ("novel_view", "novel_pose", "novel_pose_posed", "novel_pose_tracked"):
         assert (found[split]["n"], found[split]["psnr"], found[split]["per_image"]) == (0, None, [])
     assert "evaluation.holdout" in found["novel_pose"]["reason"]
