@@ -152,7 +152,10 @@ def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: 
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]
 
 
-def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_every_camera_and_the_verdict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hnerf.calibration.report.draw_evidence", lambda *_: None)  # seconds
     capture, preset = shared_capture("valid-wave"), tmp_path / "no-hands.yaml"
     preset.write_text("based_on: fast\ndetection: {hands: none}\ncapture: {max_frames: 12}\n")
     assert main(["check-cameras", str(capture), "--store", str(tmp_path), "--preset", str(preset)]) == 0
