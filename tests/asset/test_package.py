@@ -329,7 +329,8 @@ def test_nothing_but_the_interface_is_loaded_without_payloads(package: Path) -> 
 
 
 def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path) -> None:
-    far = dataclasses.replace(staged, extents_m={name: 100 * boxes for name, boxes in staged.extents_m.items()})
+    boxes = {name: 100 * boxes for name, boxes in staged.extents_m.items()}
+    far = dataclasses.replace(staged, extents_m=boxes, physiques_m={})  # which have room for the motions, too
     write_usdz(tmp_path / "far.usdz", {"": far}, [], 10.0, INFO)
     stage = Usd.Stage.Open(str(tmp_path / "far.usdz"))
     hint = np.array(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get())
@@ -373,7 +374,7 @@ def test_the_albedo_look_has_the_light_that_was_taken_out(name: str, package: Pa
     np.testing.assert_array_equal(pixels(light.GetTextureFileAttr().Get()), picture)
     assert surface.GetInput("ior").Get() == 1
     assert light.GetIntensityAttr().Get() == pytest.approx(intensity)
-    assert picture[0].min() > 100 + picture[-1].max()  # from above in the world, Z up, is above in the stage, Y up
+    assert int(picture[0].min()) > 100 + int(picture[-1].max())  # above is Z in the world and Y in the stage
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_cache.usdz"])
