@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated
 
 from prefect import flow
-from prefect.client.schemas.objects import FlowRun
 from prefect.context import FlowRunContext
 from prefect.deployments import run_deployment
 from prefect.events import emit_event
@@ -21,7 +20,7 @@ from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.errors import InputError
 from tasks import quarantine
 from tasks.bucket import is_visible
-from tasks.ledger import Ledger, was_started
+from tasks.ledger import Ledger
 from tasks.remote import remote_captures
 from tasks.source import entries, place, read_capture
 
@@ -53,7 +52,7 @@ def ingest_captures(
         settle_s: A folder that changed less than this many seconds ago counts as still being written. For a bucket, set
             more than the upload of the largest file takes.
         max_unfinished: Start nothing while this many runs are waiting or running.
-        max_restarts: How often to restart a run whose process or machine was lost; then it fails.
+        max_restarts: How often to restart a run whose process or machine was lost, before it fails.
         min_free_gib: Start nothing while the store's disk has less free space than this, in GiB.
     """
     ledger = Ledger.of(store)
@@ -64,7 +63,8 @@ def ingest_captures(
     if not _has_room(store, min_free_gib):
         return []
     for lost, why in restart_crashed(max_restarts):
-        note_lost(lost, why, store)
+        capture = place(lost.parameters["capture"])
+        quarantine.note_run(capture, store, f"failed: {why} (flow run {lost.name}, {lost.id})")
     started: list[str] = []
     room = max_unfinished
     for capture, listing, digest in _unseen(folder, ledger, settle_s):
@@ -84,14 +84,6 @@ def ingest_captures(
             started.append(Path(capture).name)
         ledger.note_seen(listing, digest)
     return started
-
-
-def note_lost(run: FlowRun, why: str, store: Path) -> None:
-    """Say in the folder that is watched why a capture that was started from there has no result."""
-    capture = place(run.parameters["capture"])
-    if isinstance(capture, Path) and was_started(store, capture):
-        with suppress(OSError):  # a folder that may only be read, or is gone
-            quarantine.note(capture, f"failed: {why} (flow run {run.name}, {run.id})")
 
 
 def _has_room(store: Path, min_free_gib: float) -> bool:

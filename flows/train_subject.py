@@ -14,7 +14,7 @@ from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import recorded_cameras
 from hnerf.config import Settings, load_settings
-from hnerf.errors import InputError, InvalidAsset, one_line, printable
+from hnerf.errors import InputError, InvalidAsset, one_line
 from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
 from tasks.bucket import BucketError
@@ -24,9 +24,9 @@ from tasks.detection import detect, find_hands, needs_detection, needs_hands
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.launcher import RankFailedError
-from tasks.ledger import forget, was_started
+from tasks.ledger import forget
 from tasks.limits import StalledError, set_limits
-from tasks.quarantine import clear, note
+from tasks.quarantine import clear, note_run
 from tasks.remote import NothingThereError, fetched, remote_capture
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import place, read_capture
@@ -130,11 +130,10 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
     """Say why in the folder that is watched, if the capture was started from there."""
     capture, store = place(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
     error = state.result(raise_on_failure=False)
-    if isinstance(error, Exception) and isinstance(capture, Path) and was_started(store, capture):
+    if isinstance(error, Exception):
         kind = "refused" if isinstance(error, InputError) else "failed"
         why = str(error) if isinstance(error, NOTED) else f"{type(error).__name__}: {one_line(error)}"
-        with suppress(OSError):  # a folder that may only be read, or is gone
-            note(capture, printable(f"{kind}: {why} (flow run {flow_run.name}, {flow_run.id})"))
+        note_run(capture, store, f"{kind}: {why} (flow run {flow_run.name}, {flow_run.id})")
 
 
 @train_subject.on_completion

@@ -2,10 +2,12 @@
 
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from hnerf.errors import printable
 from hnerf.files import replace_text
+from tasks.ledger import was_started
 
 FOLDER = ".refused"
 REMEDY = "Correct the folder: a capture that has changed is tried again by itself. To remove this note, remove it."
@@ -18,6 +20,13 @@ def note(capture: Path, why: str) -> None:
     text = f"{printable(capture.name)}: {printable(why)}\n\n{REMEDY}\n"
     if path.is_symlink() or not path.is_file() or path.read_text(errors="replace").partition("\n\nSeen ")[0] != text:
         replace_text(path, f"{text}\n\nSeen {time.strftime('%Y-%m-%d %H:%M:%S %z')}\n")
+
+
+def note_run(capture: Path | str, store: Path, why: str) -> None:
+    """Say why a run gave no result, if its capture was started from a watched folder (not in a bucket)."""
+    if isinstance(capture, Path) and was_started(store, capture):
+        with suppress(OSError):  # a folder that may only be read, or is gone
+            note(capture, why)
 
 
 def clear(capture: Path) -> None:

@@ -330,7 +330,7 @@ def test_nothing_but_the_interface_is_loaded_without_payloads(package: Path) -> 
 
 def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path) -> None:
     boxes = {name: 100 * boxes for name, boxes in staged.extents_m.items()}
-    far = dataclasses.replace(staged, extents_m=boxes, physiques_m={})  # which have room for the motions, too
+    far = dataclasses.replace(staged, extents_m=boxes, physiques_m={})  # boxes of physiques have room for motions, too
     write_usdz(tmp_path / "far.usdz", {"": far}, [], 10.0, INFO)
     stage = Usd.Stage.Open(str(tmp_path / "far.usdz"))
     hint = np.array(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get())
