@@ -23,6 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 COPIED = ("hnerf", "tasks", "flows", "tests", "configs", "pyproject.toml")
+LIMIT_S = 300.0  # for the tests of a fault, which take seconds; some faults make them wait for ever
 PYTEST = (sys.executable, "-m", "pytest", "-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider")
 
 
@@ -431,10 +432,16 @@ def copied(root: Path) -> Iterator[Path]:
         yield Path(folder)
 
 
-def first_red(folder: Path, tests: list[str]) -> str | None:
-    """The first test that fails there, None if all pass; RuntimeError, with what pytest says, if they cannot be run."""
+def first_red(folder: Path, tests: list[str], limit_s: float | None = None) -> str | None:
+    """The first test that fails there, or the time limit if they do not end, None if all pass; RuntimeError, with what
+    pytest says, if they cannot be run."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run([*PYTEST, *tests], cwd=folder, env=environment, capture_output=True, text=True)
+    try:
+        done = subprocess.run(
+            [*PYTEST, *tests], cwd=folder, env=environment, capture_output=True, text=True, timeout=limit_s
+        )
+    except subprocess.TimeoutExpired:
+        return f"its time limit of {limit_s:g} s"
     red = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
     if done.returncode > 1 or (done.returncode == 1 and not red):
         raise RuntimeError(f"pytest {' '.join(tests)} ends with {done.returncode}:\n{done.stdout[-3000:]}{done.stderr}")
@@ -446,7 +453,7 @@ def judge(fault: Fault, root: Path = ROOT) -> Verdict:
     began, faulty = time.monotonic(), with_fault(fault, root)
     with copied(root) as folder:
         (folder / fault.file).write_text(faulty)
-        red = first_red(folder, [fault.tests])
+        red = first_red(folder, [fault.tests], LIMIT_S)
     return Verdict(fault, red, time.monotonic() - began)
 
 

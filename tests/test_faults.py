@@ -42,6 +42,12 @@ def test_faults_are_caught_or_missed(code: Path) -> None:
     assert (code / "hnerf" / "sums.py").read_text() == before
 
 
+def test_tests_that_a_fault_makes_wait_for_ever_are_ended(code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It adds zeros without end."""
+    monkeypatch.setattr("tests.faults.LIMIT_S", 2.0)
+    assert judge(Fault("sum", "sums", "a + b", "sum(iter(int, 1))"), code).red == "its time limit of 2 s"
+
+
 def test_what_cannot_run_is_no_catch(code: Path) -> None:
     broken = Fault("sum", "sums", "a + b", "a +")
     with pytest.raises(RuntimeError, match="SyntaxError"):
