@@ -9,6 +9,7 @@ The unknowns of a frame, in this order: the root joint's displacement (3) in met
 axes, then the change of axis-angle (3) of every other moving joint.
 """
 
+import functools
 from dataclasses import dataclass, replace
 
 import torch
@@ -63,41 +64,45 @@ class PosedSkin(PosedJoints):
     bent_m: Tensor
 
 
+@dataclass(frozen=True)
+class FixedParts:
+    """What of an articulation no change of shape touches.
+
+    joints (M,) of the rig that move; parents (M,) and carrier (J,): the moving joint above each of these, and the one
+    that each of the rig's joints follows. subtree (M, M): 1 at [j, m] if turning j moves m. vertex_weights (V, M).
+    keypoint_vertices (V,) bool: the U vertices of which keypoints are sums; keypoint_carried (25, M) bool: the N pairs
+    of a keypoint and a moving joint that carries part of it; keypoint_split (N, U): what each vertex gives to these.
+    """
+
+    joints: Tensor
+    parents: Tensor
+    carrier: Tensor
+    subtree: Tensor
+    vertex_weights: Tensor
+    keypoint_vertices: Tensor
+    keypoint_carried: Tensor
+    keypoint_split: Tensor
+
+
 class Articulation:
     """The moving joints of a rig: the root (index 0), then the free joints, parents first."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
-        moves = rig.free.clone()
-        moves[0] = True
-        self.joints = moves.nonzero()[:, 0]
-        carrier = torch.zeros(len(moves), dtype=torch.long)
-        slot = moves.cumsum(0) - 1
-        for j, parent in enumerate(rig.parents.tolist()):
-            carrier[j] = slot[j] if moves[j] else carrier[parent]
-        self.carrier = carrier  # index of the moving joint that each joint follows, (J,)
-        self.parents = carrier[rig.parents[self.joints].clamp(min=0)]
-        count = len(self.joints)
-        self.subtree = torch.eye(count, dtype=rig.vertices_m.dtype)  # below[j, m] = 1 if turning j moves m
-        for m in range(1, count):
-            self.subtree[:, m] += self.subtree[:, self.parents[m]]
-        self.vertex_weights = torch.zeros(len(rig.vertices_m), count, dtype=rig.vertices_m.dtype)
-        self.vertex_weights.scatter_add_(1, carrier[rig.skin_joints], rig.skin_weights)
+        self.fixed = _fixed_parts(rig.parents, rig.free, rig.skin_joints, rig.skin_weights, rig.keypoint_weights)
+        self.joints, self.parents, self.carrier = self.fixed.joints, self.fixed.parents, self.fixed.carrier
+        self.subtree, self.vertex_weights = self.fixed.subtree, self.fixed.vertex_weights
         self.rest_m, self.rest_basis_m = rig.joints_m[self.joints], rig.joint_basis[:, self.joints].permute(1, 2, 0)
-        self.unknowns = 3 + 3 * count
+        self.unknowns = 3 + 3 * len(self.joints)
 
     def keypoints(self) -> Points:
         """Return the 25 BODY_25 keypoints as points on the rest body."""
-        used = (self.rig.keypoint_weights != 0).any(0)
-        rows, weights = self.rig.keypoint_weights[:, used], self.vertex_weights[used]
-        carried = (rows != 0).float() @ (weights != 0).float() > 0  # (25, M), few of them
-        keypoint, joint = carried.nonzero(as_tuple=True)
-        split = rows[keypoint] * weights.T.contiguous()[joint]  # (carried, V used)
+        used, carried, split = self.fixed.keypoint_vertices, self.fixed.keypoint_carried, self.fixed.keypoint_split
         columns = torch.cat([self.rig.vertices_m[None, used], self.rig.shape_basis[:, used]]).transpose(0, 1).flatten(1)
-        sums = torch.zeros(*carried.shape, columns.shape[1], dtype=rows.dtype)
+        sums = torch.zeros(*carried.shape, columns.shape[1], dtype=columns.dtype)
         sums[carried] = split @ columns
         sums = sums.unflatten(-1, (-1, 3)).transpose(-1, -2)  # (25, M, 3, 1 + B)
-        shares = torch.zeros(carried.shape, dtype=rows.dtype)
+        shares = torch.zeros(carried.shape, dtype=split.dtype)
         shares[carried] = split.sum(1)
         return Points(shares, sums[..., 0], sums[..., 1:])
 
@@ -200,6 +205,30 @@ class Articulation:
         root[:, :3, 3] += step[:, :3] + (pose.root[:, :3, :3] - rotation) @ self.rest_m[0]
         root[:, :3, :3] = rotation
         return replace(pose, theta=theta, root=root)
+
+
+@functools.lru_cache(maxsize=4)  # by identity: the rigs of one body share these tensors at every shape
+def _fixed_parts(
+    parents: Tensor, free: Tensor, skin_joints: Tensor, skin_weights: Tensor, keypoint_weights: Tensor
+) -> FixedParts:
+    moves = free.clone()
+    moves[0] = True
+    joints = moves.nonzero()[:, 0]
+    carrier = torch.zeros(len(moves), dtype=torch.long)
+    slot = moves.cumsum(0) - 1
+    for j, parent in enumerate(parents.tolist()):
+        carrier[j] = slot[j] if moves[j] else carrier[parent]
+    above = carrier[parents[joints].clamp(min=0)]
+    subtree = torch.eye(len(joints), dtype=skin_weights.dtype)
+    for m in range(1, len(joints)):
+        subtree[:, m] += subtree[:, above[m]]
+    weights = torch.zeros(len(skin_weights), len(joints), dtype=skin_weights.dtype)
+    weights.scatter_add_(1, carrier[skin_joints], skin_weights)
+    used = (keypoint_weights != 0).any(0)
+    carried = (keypoint_weights != 0).float() @ (weights != 0).float() > 0  # few of them
+    keypoint, joint = carried.nonzero(as_tuple=True)
+    split = keypoint_weights[keypoint][:, used] * weights[used].T.contiguous()[joint]
+    return FixedParts(joints, above, carrier, subtree, weights, used, carried, split)
 
 
 def with_offsets(points: Points, offsets_m: Tensor) -> Points:

@@ -1,7 +1,7 @@
 """The body models that a fit can use: a rig for any shape, and a prior on shapes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -12,6 +12,7 @@ from hnerf.body.rig import Rig
 from hnerf.body.smpl import BETAS, T_POSE_BONES, read_smpl, rest_rotations
 from hnerf.config import FitSettings
 
+SHAPED = ("vertices_m", "joints_m", "beta", "shape_basis", "joint_basis")  # what of a rig follows its shape
 SMPL_BETA_LIMIT = 5.0  # standard deviations
 
 
@@ -41,8 +42,11 @@ def body_model(settings: FitSettings) -> BodyModel:
 
 
 def _anny(settings: FitSettings) -> BodyModel:
+    average = anny_rig().to(dtype=torch.float64)
+
     def rig(beta: Tensor | None) -> Rig:
-        return anny_rig(beta).to(dtype=torch.float64)
+        shaped = anny_rig(beta)
+        return replace(average, **{name: getattr(shaped, name).double() for name in SHAPED})
 
     std = [settings.phenotype_std] * len(PHENOTYPES) + [settings.local_change_std] * len(LOCAL_CHANGES)
     mean, stds, low, high = (torch.tensor(v, dtype=torch.float64) for v in (ADULT, std, BETA_LOW, BETA_HIGH))
