@@ -12,7 +12,6 @@ from prefect.client.schemas.objects import FlowRun, State
 from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
-from hnerf.capture.ingest import recorded_cameras
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, InvalidAsset, one_line
 from hnerf.evaluation.holdout import held_out_cameras
@@ -82,12 +81,10 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     artifact_store = Store(store.resolve())
     capture = place(capture)
     source, truth = read_capture(local_folder(artifact_store, capture), store)
-    if settings.evaluation.holdout:
-        cameras = recorded_cameras(source.root)
-        held_out_cameras(cameras.train, cameras.test, settings.evaluation.holdout)  # refuses before any work is done
-
     recorded = ingest(artifact_store, source, settings.capture)
-    subject = Capture.load(recorded.root).name
+    normalised = Capture.load(recorded.root)
+    held_out_cameras(normalised.train_cameras, normalised.test_cameras, settings.evaluation.holdout)
+    subject = normalised.name
     artifact_store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
     artifact_store.link_latest(subject, recorded)
     recording = artifact_store.link_latest(subject, with_detections(artifact_store, recorded, settings))

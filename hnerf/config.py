@@ -307,10 +307,12 @@ class AssetSettings(Section):
 
 
 class LimitSettings(Section):
-    """Time limits: how long a stage may make no progress before it is ended. No result depends on them."""
+    """Limits: how long a stage may make no progress before it is ended, and how much memory a recording's files may
+    need while they are read. No result depends on them."""
 
     stage_s: float = Field(default=1800.0, gt=0)  # a stage may make no progress for this long, plus
     image_s: float = Field(default=5.0, ge=0)  # this for each image: frames times cameras
+    reader_gib: float = Field(default=8.0, gt=0)  # of memory for the process that reads a recording's files
 
 
 class Settings(Section):

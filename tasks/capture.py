@@ -6,6 +6,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest as ingest_folder
 from hnerf.capture.subset import subset
 from hnerf.config import CaptureSettings
+from tasks.cage import run_caged
 from tasks.source import Source, require_unchanged
 from tasks.stage import stage
 from tasks.store import Artifact
@@ -14,8 +15,9 @@ from tasks.store import Artifact
 @stage("capture", version="15")
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
     """Read a recording in any supported layout; undistort and normalise it."""
-    capture = ingest_folder(source.root, settings, out)
+    run_caged(ingest_folder, source.root, settings, out, folder=source.root)
     require_unchanged(source)
+    capture = Capture.load(out)
     return {"cameras": len(capture.cameras), "frames": len(capture.frames)}
 
 

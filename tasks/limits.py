@@ -36,9 +36,14 @@ def set_limits(settings: LimitSettings) -> None:
     _settings.set(settings)
 
 
+def current_limits() -> LimitSettings:
+    """Return the limits that `set_limits` applied."""
+    return _settings.get(LimitSettings())
+
+
 def limit_s(images: int) -> float:
     """Return for how long a stage that works on this many images may make no progress."""
-    settings = _settings.get(LimitSettings())
+    settings = current_limits()
     return settings.stage_s + settings.image_s * images
 
 

@@ -396,6 +396,13 @@ FAULTS = (
     Fault("shared-later", "tasks/shared", "if bucket.size_bytes(_object(artifact.name)) is None:", "if False:"),
     Fault("limit-progress", "tasks/limits", "            arm()\n\n    def end", "            pass\n\n    def end"),
     Fault("limit-end", "tasks/limits", "exit=True", "exit=False"),
+    Fault("cage-unused", "tasks/capture", "run_caged(ingest_folder, source.root, settings, out, folder=source.root)",
+          "ingest_folder(source.root, settings, out)"),
+    Fault("cage-memory", "tasks/cage", "_limit(resource.RLIMIT_DATA, memory_bytes)", "pass"),
+    Fault("cage-time", "tasks/cage", "    _limit_processor_time(patience_s)\n    try", "    try"),
+    Fault("cage-comes-on", "tasks/cage", "        _limit_processor_time(patience_s)\n        _send", "        _send"),
+    Fault("cage-network", "tasks/cage", "    _give_up_network()\n    replies", "    replies"),
+    Fault("cage-outlives", "tasks/cage", "    end_with_parent(signal.SIGKILL, parent)\n", ""),
 )  # fmt: skip
 
 

@@ -26,7 +26,6 @@ from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import (
     NO_FRAME,
-    CameraSplit,
     CaptureManifest,
     capture_name,
     chosen_cameras,
@@ -134,13 +133,6 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     )
     capture.save()
     return capture
-
-
-def recorded_cameras(folder: Path) -> CameraSplit:
-    """Return which cameras of a capture folder are for training and which for testing. Raises InputError as `ingest`
-    does."""
-    layout = recognise(folder)
-    return chosen_cameras(folder, read_manifest(folder), list(layout.lenses()), layout.training_cameras())
 
 
 def exported_lenses(folder: Path) -> list[Lens]:

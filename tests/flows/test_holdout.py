@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -118,26 +119,27 @@ def test_without_the_setting_nothing_is_left_out(calls: list[dict[str, Any]], tm
 
 
 @pytest.mark.parametrize(
-    ("holdout", "notes", "message"),
+    ("holdout", "train", "message"),
     [
-        ("cam9", "name = 'ada'", "evaluation.holdout=cam9: no such training camera; there are 01, 02, 03"),
-        ("each", "[cameras]\ntrain = ['01', '02']\n", "fewer than 2 of the 2 training cameras would be left"),
+        ("cam9", CAMERAS, "evaluation.holdout=cam9: no such training camera; there are 01, 02, 03"),
+        ("each", CAMERAS[:2], "fewer than 2 of the 2 training cameras would be left"),
     ],
 )
-def test_what_cannot_be_left_out_is_told_before_any_work(
+def test_what_cannot_be_left_out_is_told_once_the_recording_is_read(
     calls: list[dict[str, Any]],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
     holdout: str,
-    notes: str,
+    train: tuple[str, ...],
     message: str,
 ) -> None:
-    (tmp_path / "ada" / "capture.toml").write_text(notes)
+    monkeypatch.setattr(sys.modules[__name__], "CAMERAS", train)
     options = ["--store", str(tmp_path / "store"), "--set", f"evaluation.holdout={holdout}"]
     assert main(["run", str(tmp_path / "ada"), *options]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
-    assert calls == []
+    assert [call["stage"] for call in calls] == ["capture"]
 
 
 def test_what_calibration_rejects_cannot_be_left_out(

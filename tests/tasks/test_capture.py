@@ -1,13 +1,14 @@
 """The artifact of a recording."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from hnerf.capture.capture import Capture
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tasks import capture as module
+from tasks.cage import run_caged
 from tasks.source import read_capture
 from tasks.store import Store
 from tests.capture.recordings import write_easymocap
@@ -16,13 +17,13 @@ from tests.capture.recordings import write_easymocap
 def test_a_recording_that_changes_while_it_is_read_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else it would be found under the digest of what was there before."""
 
-    def changing(root: Path, settings: CaptureSettings, out: Path) -> Capture:
-        (root / "new.txt").touch()
-        return read(root, settings, out)
+    def changing(*arguments: Any, folder: Path) -> None:
+        (folder / "new.txt").touch()
+        run_caged(*arguments, folder=folder)
 
-    read, store = module.ingest_folder, Store(tmp_path / "store")
+    store = Store(tmp_path / "store")
     source, _ = read_capture(write_easymocap(tmp_path / "folder"))
-    monkeypatch.setattr(module, "ingest_folder", changing)
+    monkeypatch.setattr(module, "run_caged", changing)
     with pytest.raises(InputError, match="folder: changed or moved since the command started"):
         module.ingest(store, source, CaptureSettings())
     assert not store.root.exists()

@@ -1,6 +1,7 @@
 """The PeopleSnapshot layout: camera.pkl, one video, masks.hdf5, keypoints.hdf5, reconstructed_poses.hdf5."""
 
 import math
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -137,6 +138,7 @@ def _mask(path: Path, row: int) -> np.ndarray:
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file. Raises InputError if it cannot be read."""
+    sys.audit("open", str(path), "r", 0)  # as Python's own open says what it opens
     try:
         with h5py.File(path, "r") as file:
             yield file

@@ -1,0 +1,186 @@
+"""A process of its own, with limits, in which strangers' files are read.
+
+A reader that crashes, or that wants all memory, all processors or the network, ends this process and not the run. It
+gets its work pickled from the run; what comes back is text, a JSON object a line:
+
+    {"log": [logger, level, message]}, {"progress": [what, done, total]}, {"opened": path}
+    {"error": "InputError" | "OSError" | "other", "arguments": [...]}, at most one
+"""
+
+import ctypes
+import errno
+import json
+import logging
+import os
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TextIO
+
+from hnerf.errors import InputError
+from hnerf.processes import end_with_parent
+from hnerf.progress import Progress, listening, report
+from tasks.launcher import KILLED, LostWorkerError
+from tasks.limits import current_limits, limit_s
+
+MAX_WRITTEN_BYTES = 1 << 32  # a file: one picture, or the keypoints of a camera
+MAX_OPEN_FILES = 1024
+CLONE_NEWUSER, CLONE_NEWNET = 0x10000000, 0x40000000  # linux/sched.h
+BEYOND = {errno.EFBIG: "what is written of it is too large", errno.EMFILE: "it needs too many open files"}
+NO_MEMORY = -4  # cv2.Error.StsNoMem
+
+
+def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> None:
+    """Call `read(*arguments)`, which reads files of `folder`, in a process of its own; log what it logs.
+
+    Memory, processor time without progress, size and number of files are limited, and there is no network where the
+    system lets a process give it up. Raises InputError that names the file where a limit ends it or it crashes,
+    LostWorkerError where it was killed from outside, and what it raises itself: InputError and OSError as they are,
+    others as RuntimeError.
+    """
+    size = int(current_limits().reader_gib * (1 << 30))
+    work = pickle.dumps((read, arguments, str(folder), size, limit_s(1)))
+    with subprocess.Popen(
+        [sys.executable, "-m", "tasks.cage", str(os.getpid())],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONSAFEPATH": "1", "MALLOC_ARENA_MAX": "4"},
+        start_new_session=True,
+    ) as reader:
+        try:
+            assert reader.stdin is not None and reader.stdout is not None
+            reader.stdin.write(work)
+            reader.stdin.close()
+            opened, error = folder, None
+            for line in reader.stdout:
+                message = json.loads(line)
+                opened = Path(message.get("opened", opened))
+                error = message if "error" in message else error
+                _pass_on(message)
+        except BaseException:
+            reader.kill()
+            raise
+    if error:
+        raise _exception(**error)
+    if reader.returncode > 0:
+        raise RuntimeError(f"{opened}: its reader ended with exit code {reader.returncode}")
+    if reader.returncode < 0:
+        raise _killed(opened, signal.Signals(-reader.returncode))
+
+
+def _pass_on(message: dict[str, Any]) -> None:
+    if "progress" in message:
+        report(*message["progress"])
+    if "log" in message:
+        name, level, text = message["log"]
+        logging.getLogger(name).log(level, "%s", text)
+
+
+def _exception(error: str, arguments: list[Any]) -> Exception:
+    kinds: dict[str, type[Exception]] = {"InputError": InputError, "OSError": OSError}
+    return kinds.get(error, RuntimeError)(*arguments)
+
+
+def _killed(opened: Path, by: signal.Signals) -> Exception:
+    if by in KILLED:
+        return LostWorkerError(f"{opened}: its reader was killed by {by.name}")
+    if by == signal.SIGXCPU:
+        why = f"no progress in {limit_s(1):.0f} s of a processor's time"
+    else:
+        why = f"reading it crashed ({by.name})"
+    return InputError(f"{opened}: {why}; export it again")
+
+
+def _main(parent: int) -> None:
+    """Do the work that comes on standard input."""
+    end_with_parent(signal.SIGKILL, parent)
+    _give_up_network()
+    replies = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # what libraries print
+    read, arguments, folder, memory_bytes, patience_s = pickle.load(sys.stdin.buffer)
+    opened = Path(folder)
+
+    def note_opened(event: str, given: tuple[object, ...]) -> None:
+        nonlocal opened
+        if event == "open" and isinstance(given[0], str) and given[0].startswith(folder):
+            opened = Path(given[0])
+            _send(replies, opened=given[0])
+
+    def progressed(progress: Progress) -> None:
+        _limit_processor_time(patience_s)
+        _send(replies, progress=progress)
+
+    sys.addaudithook(note_opened)
+    logging.getLogger("hnerf").addHandler(_Sender(replies))
+    _limit(resource.RLIMIT_DATA, memory_bytes)
+    _limit(resource.RLIMIT_FSIZE, MAX_WRITTEN_BYTES)
+    _limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
+    _limit(resource.RLIMIT_CORE, 0)
+    _limit_processor_time(patience_s)
+    try:
+        with listening(progressed):
+            read(*arguments)
+    except Exception as error:
+        _send(replies, **_told(error, opened, memory_bytes))
+
+
+def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object]:
+    """Return what the run is told of an error; one of a limit names the file that was opened last."""
+    number = error.errno if isinstance(error, OSError) else None
+    if isinstance(error, MemoryError) or getattr(error, "code", None) == NO_MEMORY:
+        why = f"reading it needs more than {memory_bytes / (1 << 30):g} GiB"
+        return {"error": "InputError", "arguments": [f"{opened}: {why}; export it again, or raise limits.reader_gib"]}
+    if number in BEYOND:
+        return {"error": "InputError", "arguments": [f"{opened}: {BEYOND[number]}; export it again"]}
+    if isinstance(error, InputError):
+        return {"error": "InputError", "arguments": [str(error)]}
+    if isinstance(error, OSError):
+        name = None if error.filename is None else str(error.filename)
+        return {"error": "OSError", "arguments": [number, error.strerror or str(error), name]}
+    return {"error": "other", "arguments": [traceback.format_exc()]}
+
+
+def _send(replies: TextIO, **message: object) -> None:
+    replies.write(json.dumps(message) + "\n")
+
+
+class _Sender(logging.Handler):
+    def __init__(self, replies: TextIO) -> None:
+        super().__init__()
+        self.replies = replies
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a record to the run."""
+        _send(self.replies, log=[record.name, record.levelno, record.getMessage()])
+
+
+def _give_up_network() -> None:
+    """Have no network from here on, where the system lets a process without rights or as root say so."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "unshare") and libc.unshare(CLONE_NEWNET):
+        libc.unshare(CLONE_NEWUSER | CLONE_NEWNET)
+
+
+def _limit(what: int, most: int) -> None:
+    _, allowed = resource.getrlimit(what)
+    most = most if allowed == resource.RLIM_INFINITY else min(most, allowed)
+    resource.setrlimit(what, (most, most))
+
+
+def _limit_processor_time(seconds: float) -> None:
+    """Let this process use that much of a processor's time from now on."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    _, allowed = resource.getrlimit(resource.RLIMIT_CPU)
+    most = int(used.ru_utime + used.ru_stime + seconds) + 1
+    resource.setrlimit(
+        resource.RLIMIT_CPU, (most if allowed == resource.RLIM_INFINITY else min(most, allowed), allowed)
+    )
+
+
+if __name__ == "__main__":
+    _main(int(sys.argv[1]))

@@ -1,0 +1,184 @@
+import ctypes
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from hnerf.config import LimitSettings
+from hnerf.errors import InputError
+from hnerf.progress import Progress, listening, report
+from tasks.cage import CLONE_NEWNET, CLONE_NEWUSER, run_caged
+from tasks.launcher import LostWorkerError
+from tasks.limits import StalledError, limited, set_limits
+
+HERE = Path(__file__).parents[2]
+WITHOUT_NETWORK = f"import ctypes, sys; sys.exit(bool(ctypes.CDLL(None).unshare({CLONE_NEWUSER | CLONE_NEWNET})))"
+
+
+@pytest.fixture(autouse=True)
+def readers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the reader's process find the functions below."""
+    monkeypatch.setenv("PYTHONPATH", str(HERE), prepend=os.pathsep)
+
+
+def read_first(folder: Path) -> Path:
+    """Open a file as readers do, so that it is known as the last one; return it."""
+    path = folder / "first.bin"
+    path.open("rb").close()
+    return path
+
+
+def crashes(folder: Path) -> None:
+    read_first(folder)
+    ctypes.string_at(0)
+
+
+def wants_all_memory(folder: Path) -> None:
+    read_first(folder)
+    bytearray(3 << 29)
+
+
+def never_ends(folder: Path) -> None:
+    read_first(folder)
+    while True:
+        pass
+
+
+def takes_long(folder: Path) -> None:
+    for number in range(3):
+        report("camera 1", number, 3)
+        began_s = time.process_time()
+        while time.process_time() < began_s + 1.2:
+            pass
+
+
+def waits(folder: Path) -> None:
+    (folder / "reader").write_text(str(os.getpid()))
+    time.sleep(60)
+
+
+def writes_without_end(folder: Path) -> None:
+    read_first(folder)
+    with tempfile.TemporaryFile() as file:
+        file.truncate(1 << 33)
+        file.flush()
+
+
+def opens_everything(folder: Path) -> None:
+    path = read_first(folder)
+    kept = [path.open("rb") for _ in range(2000)]
+    assert kept
+
+
+def calls_home(folder: Path, port: int) -> None:
+    socket.create_connection(("127.0.0.1", port), timeout=5)
+
+
+def is_killed(folder: Path) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def reads(folder: Path, out: Path) -> None:
+    logging.getLogger("hnerf.capture").warning("%s: of 2 cameras one is black", read_first(folder))
+    report("camera 1", 3, 4)
+    print("a library says something")
+    out.write_text("read")
+
+
+def refuses(folder: Path) -> None:
+    raise InputError(f"{folder}: no calibration; give one")
+
+
+def finds_no_space(folder: Path) -> None:
+    raise OSError(28, "No space left on device", "/out")
+
+
+def is_wrong(folder: Path) -> None:
+    raise KeyError("camera")
+
+
+def sent(folder: Path) -> Path:
+    (folder / "first.bin").touch()
+    return folder
+
+
+def test_what_it_logs_reports_and_writes_is_there(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    heard: list[Progress] = []
+    with listening(heard.append):
+        run_caged(reads, sent(tmp_path), tmp_path / "out", folder=tmp_path)
+    assert [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING and r.name == "hnerf.capture"] == [
+        f"{tmp_path / 'first.bin'}: of 2 cameras one is black"
+    ]
+    assert heard == [Progress("camera 1", 3, 4)] and (tmp_path / "out").read_text() == "read"
+
+
+@pytest.mark.parametrize(
+    ("read", "why"),
+    [
+        (crashes, r"first.bin: reading it crashed \(SIGSEGV\); export it again"),
+        (wants_all_memory, "first.bin: reading it needs more than 1 GiB; export it again, or raise limits.reader_gib"),
+        (never_ends, "first.bin: no progress in 0 s of a processor's time; export it again"),
+        (writes_without_end, "first.bin: what is written of it is too large; export it again"),
+        (opens_everything, "first.bin: it needs too many open files; export it again"),
+        (refuses, "no calibration; give one"),
+    ],
+)
+def test_what_a_limit_ends_is_refused_with_the_files_name(read: object, why: str, tmp_path: Path) -> None:
+    set_limits(LimitSettings(stage_s=0.2, image_s=0, reader_gib=1))
+    with pytest.raises(InputError, match=f"^{tmp_path}.*{why}$"):
+        run_caged(read, sent(tmp_path), folder=tmp_path)  # type: ignore[arg-type]
+
+
+def test_a_reader_that_comes_on_may_take_longer(tmp_path: Path) -> None:
+    set_limits(LimitSettings(stage_s=1, image_s=0))
+    run_caged(takes_long, tmp_path, folder=tmp_path)
+
+
+def test_errors_of_the_machine_can_be_retried_and_faults_of_ours_show_where(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="No space left on device") as raised:
+        run_caged(finds_no_space, tmp_path, folder=tmp_path)
+    assert (raised.value.errno, raised.value.filename) == (28, "/out")
+    with pytest.raises(LostWorkerError, match="its reader was killed by SIGKILL"):
+        run_caged(is_killed, tmp_path, folder=tmp_path)
+    with pytest.raises(RuntimeError, match=r"in is_wrong\n(.*\n)*KeyError: 'camera'"):
+        run_caged(is_wrong, tmp_path, folder=tmp_path)
+
+
+@pytest.mark.skipif(
+    subprocess.run([sys.executable, "-c", WITHOUT_NETWORK], check=False).returncode != 0,
+    reason="the system lets no process give up its network",
+)
+def test_there_is_no_network(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, pytest.raises(OSError, match="Network is unreachable"):
+        run_caged(calls_home, tmp_path, server.getsockname()[1], folder=tmp_path)
+
+
+def test_a_reader_that_stands_still_ends_with_its_stage(tmp_path: Path) -> None:
+    set_limits(LimitSettings(stage_s=3, image_s=0))
+    with pytest.raises(StalledError), limited("capture", 1, resumable=False):
+        run_caged(waits, tmp_path, folder=tmp_path)
+    assert not Path("/proc", (tmp_path / "reader").read_text()).exists()
+
+
+def test_a_reader_ends_with_its_run(tmp_path: Path) -> None:
+    source = (
+        "import sys; from pathlib import Path; from tasks.cage import run_caged; from tests.tasks import test_cage\n"
+    )
+    source += "run_caged(test_cage.waits, Path(sys.argv[1]), folder=Path(sys.argv[1]))"
+    run, noted = subprocess.Popen([sys.executable, "-c", source, str(tmp_path)]), tmp_path / "reader"
+    while not noted.exists() or not noted.read_text():
+        time.sleep(0.05)
+    run.kill()
+    run.wait()
+    for _ in range(100):
+        if not Path("/proc", noted.read_text()).exists():
+            return
+        time.sleep(0.05)
+    pytest.fail("the reader outlived its run")
