@@ -100,14 +100,18 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
 
 def calibrate(options: argparse.Namespace) -> None:
     """Calibrate cameras from footage of a board, or from the person."""
-    if options.source == "person":
-        _calibrate_from_person(options)
-        return
-    with atomic_folder(options.out) as partial:
-        from hnerf.calibration.boards.calibrate import calibrate_from_boards
+    from tasks.cage import run_caged
 
-        found = calibrate_from_boards(options.folder, options.ground_frame)
-        found.save(partial, options.format)
+    source = _calibrate_from_person if options.source == "person" else _calibrate_from_boards
+    with atomic_folder(options.out) as partial:
+        run_caged(source, options, partial, folder=options.folder)
+
+
+def _calibrate_from_boards(options: argparse.Namespace, out: Path) -> None:
+    from hnerf.calibration.boards.calibrate import calibrate_from_boards
+
+    found = calibrate_from_boards(options.folder, options.ground_frame)
+    found.save(out, options.format)
     print(f"{'camera':<12} {'pictures':>8} {'RMS px':>7}  intrinsics")
     report = found.report()
     for name, camera in report["cameras"].items():
@@ -115,12 +119,11 @@ def calibrate(options: argparse.Namespace) -> None:
     print(f"all: {report['rms_px']:.2f} px RMS\ncameras: {options.out}\npicture: {options.out / 'boards.png'}")
 
 
-def _calibrate_from_person(options: argparse.Namespace) -> None:
-    with atomic_folder(options.out) as partial:
-        from hnerf.calibration.person.recording import calibrate_recording
+def _calibrate_from_person(options: argparse.Namespace, out: Path) -> None:
+    from hnerf.calibration.person.recording import calibrate_recording
 
-        found = calibrate_recording(options.folder, options.height, options.lens, options.fov)
-        found.save(partial, options.format, pose2sim=(options.folder / "pose").is_dir())
+    found = calibrate_recording(options.folder, options.height, options.lens, options.fov)
+    found.save(out, options.format, pose2sim=(options.folder / "pose").is_dir())
     print(f"{'camera':<12} {'median px':>9} {'+- degrees':>10} {'+- cm':>6} {'+- % focal':>10}  intrinsics")
     for name, camera in found.report()["cameras"].items():
         off = camera["uncertainty"]
@@ -131,14 +134,21 @@ def _calibrate_from_person(options: argparse.Namespace) -> None:
 
 def synchronise(options: argparse.Namespace) -> None:
     """Find the start offset and the clock drift of each camera; write clocks.toml."""
-    from hnerf.capture.clocks import FILE, write_clocks
+    from hnerf.capture.clocks import FILE
 
     path = options.folder / FILE
     if path.exists():
         raise InputError(f"{path}: exists; remove it to synchronise again")
-    from hnerf.calibration.clocks.recording import synchronise_recording
+    from tasks.cage import run_caged
 
-    found, sources = synchronise_recording(options.folder)
+    run_caged(_synchronise, options.folder, path, folder=options.folder)
+
+
+def _synchronise(folder: Path, path: Path) -> None:
+    from hnerf.calibration.clocks.recording import synchronise_recording
+    from hnerf.capture.clocks import write_clocks
+
+    found, sources = synchronise_recording(folder)
     write_clocks(path, found.clocks)
     print(f"{'camera':<12} {'offset s':>9} {'+- ms':>6} {'drift ppm':>9}  from")
     for name, clock in found.clocks.items():
@@ -153,12 +163,18 @@ def export_cameras(options: argparse.Namespace) -> None:
     """Write the cameras of a capture in the format of another tool."""
     if options.folder.resolve() in options.out.resolve().parents:
         raise InputError(f"{options.out}: lies in the recording, whose results would be computed again; give another")
-    with atomic_folder(options.out) as partial:
-        from hnerf.capture.formats.export import write_cameras
-        from hnerf.capture.ingest import exported_lenses
+    from tasks.cage import run_caged
 
-        write_cameras(partial, exported_lenses(options.folder), options.format)
+    with atomic_folder(options.out) as partial:
+        run_caged(_export_cameras, options, partial, folder=options.folder)
     print(f"cameras: {options.out}")
+
+
+def _export_cameras(options: argparse.Namespace, out: Path) -> None:
+    from hnerf.capture.formats.export import write_cameras
+    from hnerf.capture.ingest import exported_lenses
+
+    write_cameras(out, exported_lenses(options.folder), options.format)
 
 
 def benchmark(options: argparse.Namespace) -> None:

@@ -3,12 +3,13 @@
 A reader that crashes, or that wants all memory, all processors or the network, ends this process and not the run. It
 gets its work pickled from the run; what comes back is text, a JSON object a line:
 
-    {"log": [logger, level, message]}, {"progress": [what, done, total]}, {"opened": path}
+    {"log": [logger, level, message]}, {"progress": [what, done, total]}, {"opened": path}, {"printed": text}
     {"error": "InputError" | "OSError" | "other", "arguments": [...]}, at most one
 """
 
 import ctypes
 import errno
+import io
 import json
 import logging
 import os
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -36,7 +38,8 @@ NO_MEMORY = -4  # cv2.Error.StsNoMem
 
 
 def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> None:
-    """Call `read(*arguments)`, which reads files of `folder`, in a process of its own; log what it logs.
+    """Call `read(*arguments)`, which reads files of `folder`, in a process of its own; log what it logs, print what it
+    prints.
 
     Memory, processor time without progress, size and number of files are limited, and there is no network where the
     system lets a process give it up. Raises InputError that names the file where a limit ends it or it crashes,
@@ -76,6 +79,8 @@ def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> 
 def _pass_on(message: dict[str, Any]) -> None:
     if "progress" in message:
         report(*message["progress"])
+    if "printed" in message:
+        sys.stdout.write(message["printed"])
     if "log" in message:
         name, level, text = message["log"]
         logging.getLogger(name).log(level, "%s", text)
@@ -123,7 +128,7 @@ def _main(parent: int) -> None:
     _limit(resource.RLIMIT_CORE, 0)
     _limit_processor_time(patience_s)
     try:
-        with listening(progressed):
+        with listening(progressed), redirect_stdout(_Printed(replies)):
             read(*arguments)
     except Exception as error:
         _send(replies, **_told(error, opened, memory_bytes))
@@ -147,6 +152,16 @@ def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object
 
 def _send(replies: TextIO, **message: object) -> None:
     replies.write(json.dumps(message) + "\n")
+
+
+class _Printed(io.TextIOBase):
+    def __init__(self, replies: TextIO) -> None:
+        self.replies = replies
+
+    def write(self, text: str) -> int:
+        """Send what is printed to the run."""
+        _send(self.replies, printed=text)
+        return len(text)
 
 
 class _Sender(logging.Handler):

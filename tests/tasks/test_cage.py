@@ -52,8 +52,8 @@ def never_ends(folder: Path) -> None:
 
 
 def takes_long(folder: Path) -> None:
-    for number in range(3):
-        report("camera 1", number, 3)
+    for number in range(2):
+        report("camera 1", number, 2)
         began_s = time.process_time()
         while time.process_time() < began_s + 1.2:
             pass
@@ -88,7 +88,8 @@ def is_killed(folder: Path) -> None:
 def reads(folder: Path, out: Path) -> None:
     logging.getLogger("hnerf.capture").warning("%s: of 2 cameras one is black", read_first(folder))
     report("camera 1", 3, 4)
-    print("a library says something")
+    print("camera 1: 2 frames")
+    os.write(1, b"a library says something")
     out.write_text("read")
 
 
@@ -109,13 +110,16 @@ def sent(folder: Path) -> Path:
     return folder
 
 
-def test_what_it_logs_reports_and_writes_is_there(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_it_logs_reports_prints_and_writes_is_there(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
     heard: list[Progress] = []
     with listening(heard.append):
         run_caged(reads, sent(tmp_path), tmp_path / "out", folder=tmp_path)
     assert [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING and r.name == "hnerf.capture"] == [
         f"{tmp_path / 'first.bin'}: of 2 cameras one is black"
     ]
+    assert capfd.readouterr().out == "camera 1: 2 frames\n"
     assert heard == [Progress("camera 1", 3, 4)] and (tmp_path / "out").read_text() == "read"
 
 
