@@ -147,6 +147,8 @@ class Store:
         recorded.
         """
         if found := self.find(stage, key):
+            if checkpoint:  # of a process that was killed between its commit's last steps
+                remove_checkpoint(found.root, checkpoint)
             return found
         partial = self.path(stage, key, ".partial")
         with self.locked(stage, key):
@@ -284,10 +286,17 @@ class Store:
         # The record comes first: a process that is killed before the folder is in place leaves work that resumes.
         os.replace(beside, record)
         os.replace(partial, folder)
-        for path in kept:
-            (folder / path.name).unlink()
+        if checkpoint:
+            remove_checkpoint(folder, checkpoint)
         _flush(folder.parent)
         return artifact
+
+
+def remove_checkpoint(folder: Path, name: str) -> None:
+    """Remove what begins with this name from an artifact's folder; nothing where that is read-only."""
+    for path in folder.glob(f"{name}*"):
+        with unless_read_only():
+            path.unlink(missing_ok=True)
 
 
 def require_intact(subject: Path) -> None:

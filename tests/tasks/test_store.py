@@ -138,6 +138,17 @@ def test_finished_work_that_could_not_be_recorded_resumes(
     assert [path.name for path in made.root.iterdir()] == ["model"]
 
 
+def test_what_a_killed_commit_left_of_a_checkpoint_goes_with_the_next_use(tmp_path: Path) -> None:
+    def compute() -> Artifact:
+        return Store(tmp_path).get_or_compute("training", "k", write_abc, resumable=True, checkpoint="checkpoint.pt")
+
+    made = compute()
+    recorded = sorted(path.name for path in made.root.iterdir())
+    (made.root / "checkpoint.pt").write_text("by a process killed before the last step of its commit")
+    compute()
+    assert sorted(path.name for path in made.root.iterdir()) == recorded
+
+
 def test_bad_input_leaves_nothing_to_be_resumed(tmp_path: Path) -> None:
     def refused(out: Path) -> dict[str, float]:
         write_abc(out)
