@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,9 +24,11 @@ WITHOUT_NETWORK = f"import ctypes, sys; sys.exit(bool(ctypes.CDLL(None).unshare(
 
 
 @pytest.fixture(autouse=True)
-def readers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the reader's process find the functions below."""
+def readers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Have the reader's process find the functions below; later tests have no limits of these."""
     monkeypatch.setenv("PYTHONPATH", str(HERE), prepend=os.pathsep)
+    yield
+    set_limits(LimitSettings())
 
 
 def read_first(folder: Path) -> Path:
@@ -52,10 +55,10 @@ def never_ends(folder: Path) -> None:
 
 
 def takes_long(folder: Path) -> None:
-    for number in range(2):
-        report("camera 1", number, 2)
+    for number in range(3):
+        report("camera 1", number, 3)
         began_s = time.process_time()
-        while time.process_time() < began_s + 1.2:
+        while time.process_time() < began_s + 0.55:
             pass
 
 
@@ -141,7 +144,7 @@ def test_what_a_limit_ends_is_refused_with_the_files_name(read: object, why: str
 
 
 def test_a_reader_that_comes_on_may_take_longer(tmp_path: Path) -> None:
-    set_limits(LimitSettings(stage_s=1, image_s=0))
+    set_limits(LimitSettings(stage_s=0.6, image_s=0))
     run_caged(takes_long, tmp_path, folder=tmp_path)
 
 
@@ -165,7 +168,7 @@ def test_there_is_no_network(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_stands_still_ends_with_its_stage(tmp_path: Path) -> None:
-    set_limits(LimitSettings(stage_s=3, image_s=0))
+    set_limits(LimitSettings(stage_s=2, image_s=0))
     with pytest.raises(StalledError), limited("capture", 1, resumable=False):
         run_caged(waits, tmp_path, folder=tmp_path)
     assert not Path("/proc", (tmp_path / "reader").read_text()).exists()

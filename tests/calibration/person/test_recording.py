@@ -42,7 +42,8 @@ def write_recording(
 def test_a_folder_gets_its_cameras(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, pose2sim: bool
 ) -> None:
-    monkeypatch.setattr("hnerf.calibration.person.calibrate.FRAMES", 2)
+    monkeypatch.setattr("hnerf.calibration.person.calibrate.FRAMES", 2)  # here, not in a process of its own
+    monkeypatch.setattr("tasks.cage.run_caged", lambda read, *arguments, folder: read(*arguments))
     truth = ring(3)
     seen = {name: found[:, 0] for name, found in detections(truth, 1.0).items()}
     folder, out = write_recording(tmp_path / "film", seen, pose2sim), tmp_path / "cameras"
