@@ -32,6 +32,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: "prefect_api" not in getattr(item, "fixturenames", ()))
 
 
+@pytest.fixture(autouse=True)
+def usual_limits() -> Iterator[None]:
+    """Have no limits left that a test has set."""
+    yield
+    from hnerf.config import LimitSettings
+    from tasks.limits import set_limits
+
+    set_limits(LimitSettings())
+
+
 @pytest.fixture(scope="session")
 def wave(tmp_path_factory: pytest.TempPathFactory) -> "Capture":
     """The shared capture valid-wave as ingested, for tests that write nothing into it."""
