@@ -28,8 +28,13 @@ os.environ.pop("HNERF_BUCKET", None)  # the user's
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests of a Prefect server: then one of two workers has them all, and starts the only one."""
-    items.sort(key=lambda item: "prefect_api" not in getattr(item, "fixturenames", ()))
+    """Begin with the tests of a Prefect server: then one of two workers has them all, and starts the only one; and with
+    the types, for which the other would wait at the end."""
+
+    def order(item: pytest.Item) -> tuple[bool, bool]:
+        return "prefect_api" not in getattr(item, "fixturenames", ()), item.name != "test_types_agree"
+
+    items.sort(key=order)
 
 
 @pytest.fixture(autouse=True)
