@@ -139,9 +139,9 @@ def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object
     number = error.errno if isinstance(error, OSError) else None
     if isinstance(error, MemoryError) or getattr(error, "code", None) == NO_MEMORY:
         why = f"reading it needs more than {memory_bytes / (1 << 30):g} GiB"
-        return {"error": "InputError", "arguments": [f"{opened}: {why}; export it again, or raise limits.reader_gib"]}
-    if number in BEYOND:
-        return {"error": "InputError", "arguments": [f"{opened}: {BEYOND[number]}; export it again"]}
+        error = InputError(f"{opened}: {why}; export it again, or raise limits.reader_gib")
+    elif number in BEYOND:
+        error = InputError(f"{opened}: {BEYOND[number]}; export it again")
     if isinstance(error, InputError):
         return {"error": "InputError", "arguments": [str(error)]}
     if isinstance(error, OSError):
@@ -182,9 +182,14 @@ def _give_up_network() -> None:
 
 
 def _limit(what: int, most: int) -> None:
-    _, allowed = resource.getrlimit(what)
-    most = most if allowed == resource.RLIM_INFINITY else min(most, allowed)
+    most = _allowed(what, most)
     resource.setrlimit(what, (most, most))
+
+
+def _allowed(what: int, most: int) -> int:
+    """Return the limit, or the lower one that the system already sets."""
+    _, allowed = resource.getrlimit(what)
+    return most if allowed == resource.RLIM_INFINITY else min(most, allowed)
 
 
 def _limit_processor_time(seconds: float) -> None:
@@ -192,9 +197,7 @@ def _limit_processor_time(seconds: float) -> None:
     used = resource.getrusage(resource.RUSAGE_SELF)
     _, allowed = resource.getrlimit(resource.RLIMIT_CPU)
     most = int(used.ru_utime + used.ru_stime + seconds) + 1
-    resource.setrlimit(
-        resource.RLIMIT_CPU, (most if allowed == resource.RLIM_INFINITY else min(most, allowed), allowed)
-    )
+    resource.setrlimit(resource.RLIMIT_CPU, (_allowed(resource.RLIMIT_CPU, most), allowed))
 
 
 if __name__ == "__main__":
