@@ -50,7 +50,7 @@ class Ground:
         (n, 25, 3, U) and by_shared (n, 25, 3, S).
 
         Heights on the rest body are held in each step, although shape and offsets move them, too: with their
-        derivatives, limbs are farther off (docs/findings.md, body fit).
+        derivatives, limbs are farther off (docs/experiments.md, body fit).
         """
         rest_m = (pose.rig.keypoint_weights @ pose.rig.vertices_m)[:, 2] + pose.offsets_m[:, 2]
         up = torch.eye(3, dtype=keypoints_m.dtype)[self.up]
