@@ -221,7 +221,7 @@ def render(options: argparse.Namespace) -> None:
         motion=options.motion,
         frames=options.frames,
         between=options.between and tuple(options.between),
-        shape=dict(map(_shape_change, options.shape)),
+        shape=_shape_changes(options.shape),
         volume=None if options.volume is None else options.volume / 100,
         what=tuple(dict.fromkeys(options.what.split(","))),
         size_px=options.size,
@@ -246,6 +246,13 @@ def export(options: argparse.Namespace) -> None:
     report = export_subject(options.subject, settings, options.motion, options.out, digest)
     motions = ", ".join(f"{name} ({m['poses']} poses)" for name, m in report["motions"].items())
     print(f"motions: {motions}\nasset: {options.out / 'avatar.usda'}")
+
+
+def _shape_changes(texts: list[str]) -> dict[str, float]:
+    changes = dict(map(_shape_change, texts))
+    if len(changes) < len(texts):
+        raise InputError(f"--shape {' --shape '.join(texts)}: give each name once")
+    return changes
 
 
 def _shape_change(text: str) -> tuple[str, float]:

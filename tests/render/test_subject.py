@@ -176,6 +176,7 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
         (["--frames", "9" * 5000], "give a number like 12, or FIRST:END:STEP like 0:24:2"),
         (["--shape", "height"], "--shape height: give a name and what to add"),
         (["--shape", "height=nan"], "--shape height=nan: give a name and what to add"),
+        (["--shape", "height=1", "--shape", "height=2"], "--shape height=1 --shape height=2: give each name once"),
         (["--volume", "-100"], "volume -100 %: cannot be reached with this body"),
     ],
 )
