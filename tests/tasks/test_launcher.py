@@ -8,13 +8,13 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
+from threading import Event, Thread
 
 import pytest
 
 from hnerf.errors import InputError
-from tasks import launcher
+from tasks import agent, launcher
 from tasks.launcher import LostWorkerError, RankFailedError, run_ranks
 from tasks.policy import is_retryable
 
@@ -47,17 +47,22 @@ def wait_until_running(folder: Path, count: int) -> None:
         time.sleep(0.05)
 
 
-def test_ranks_log_lines_report_progress_and_import_nothing_from_where_the_user_stands(
+def test_ranks_log_lines_as_they_come_report_progress_and_import_nothing_from_where_the_user_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Progress is not logged, too."""
     for name in ("tasks.py", "torch.py"):
         (tmp_path / name).write_text("raise SystemExit(1)")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
     with caplog.at_level(logging.INFO, logger=RANKS), caplog.at_level(logging.DEBUG, logger="hnerf.progress"):
         run_ranks(RANKS, ["ok", str(tmp_path)], processes=2)
-    lines = [record.message for record in caplog.records if record.name == RANKS]
-    assert sorted(lines) == ["rank 0 of 2", "rank 1 of 2"]
+    lines = [record for record in caplog.records if record.name == RANKS]
+    for rank in (0, 1):
+        mine = [record for record in lines if record.message.startswith(f"rank {rank} of 2 at ")]
+        delays_s = [record.created - float(record.message.split()[-1]) for record in mine]
+        assert len(delays_s) == 3 and max(delays_s) - min(delays_s) < 0.4  # they are written 0.5 s apart
+    assert len(lines) == 6
     progress = [record.progress for record in caplog.records if record.name == "hnerf.progress"]
     assert sorted(progress) == [("training", 0, 8), ("training", 1, 8)]
 
@@ -69,22 +74,10 @@ def test_threads_of_ranks_sleep_while_they_wait_unless_the_user_says_otherwise(m
     assert launcher._environment(2)["OMP_WAIT_POLICY"] == "ACTIVE"
 
 
-def test_lines_are_logged_as_they_come(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
-    with caplog.at_level(logging.INFO, logger=RANKS):
-        run_ranks(RANKS, ["slow", str(tmp_path)], processes=1)
-    lines = [record for record in caplog.records if record.name == RANKS]
-    delays_s = [record.created - float(record.message.split()[-1]) for record in lines]
-    assert len(delays_s) == 3 and max(delays_s) - min(delays_s) < 0.4  # they are written 0.5 s apart
-
-
 @pytest.mark.parametrize(
     ("mode", "error", "message"),
     [
         ("bad", InputError, r"^a\.jpg: bad; write it again$"),
-        ("raise", RuntimeError, r"rank 1 ended with exit code 1(.|\n)*ValueError: boom in rank one$"),
         ("killed", LostWorkerError, "rank 1 was killed by SIGKILL"),
     ],
 )
@@ -100,6 +93,7 @@ def test_one_failing_rank_ends_all_with_its_message(
 @pytest.mark.parametrize(
     ("code", "last_line", "error", "message"),
     [
+        (1, "ValueError: boom", RuntimeError, "^ranks: rank 1 ended with exit code 1\na warning\nValueError: boom$"),
         (2, "a.jpg: bad; write it again", InputError, r"^a\.jpg: bad; write it again$"),
         (3, "no surface: check the masks", RankFailedError, "^no surface: check the masks$"),
         (4, '[28, "No space left on device", "b.pt"]', OSError, r"^\[Errno 28\] No space left on device: 'b\.pt'$"),
@@ -124,37 +118,31 @@ def test_a_report_that_had_no_room_is_a_full_disk(tmp_path: Path) -> None:
     assert is_retryable(found) and str(found) == f"[Errno 28] No space left on device: '{tmp_path}/{launcher.FAILURE}'"
 
 
-def start_caller(folder: Path) -> "subprocess.Popen[bytes]":
-    code = f"from tasks.launcher import run_ranks; run_ranks({RANKS!r}, ['sleep', {str(folder)!r}], 2)"
-    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background job would ignore it
-    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, preexec_fn=heard)
-
-
-@pytest.mark.parametrize("fatal", [signal.SIGKILL, signal.SIGINT])
-def test_ranks_end_with_the_caller(tmp_path: Path, fatal: signal.Signals) -> None:
-    caller = start_caller(tmp_path)
+def test_ranks_end_with_a_caller_that_is_killed(tmp_path: Path) -> None:
+    """One that is interrupted ends them as one does whose time is over: tests/tasks/test_limits.py."""
+    code = f"from tasks.launcher import run_ranks; run_ranks({RANKS!r}, ['sleep', {str(tmp_path)!r}], 2)"
+    caller = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     wait_until_running(tmp_path, 2)
-    os.kill(caller.pid, fatal)
+    caller.kill()
     caller.wait()
     wait_until_running(tmp_path, 0)
 
 
-def test_torchrun_ends_whatever_thread_of_it_goes_on(tmp_path: Path) -> None:
-    code = f"""
-import threading
-from pathlib import Path
-from tasks import agent
+def test_torchrun_ends_whatever_thread_of_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(arguments: object) -> None:
+        Thread(target=Event().wait).start()
+        raise KeyboardInterrupt("while it ended its ranks")
 
-def interrupted(arguments):
-    threading.Thread(target=threading.Event().wait).start()
-    raise KeyboardInterrupt("while it ended its ranks")
-
-agent.run = interrupted
-agent.main(Path({str(tmp_path / "failure")!r}), ["-m", "nothing"])
-"""
-    command = [sys.executable, "-c", code]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    assert ended.returncode == 1 and "while it ended its ranks" in ended.stderr
+    monkeypatch.setattr(agent, "run", interrupted)
+    if not (child := os.fork()):
+        try:
+            agent.main(tmp_path / "failure", ["-m", "nothing"])
+        finally:
+            os._exit(9)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 1 and "while it ended its ranks" in capfd.readouterr().err
 
 
 def test_ranks_end_with_torchrun_which_is_worth_another_try(tmp_path: Path) -> None:
