@@ -15,16 +15,16 @@ from hnerf import synthetic
 RUN = "import sys; from flows.cli import main; sys.exit(main(sys.argv[1:]))"
 ENDED_MIDWAY = """
 import os, signal, sys, time
+from types import SimpleNamespace
 from flows.cli import main
-from hnerf import synthetic
 
 def write(out, settings):
-    import hnerf.calibration.person.rig, hnerf.capture.formats.colmap
+    import hnerf.pycolmap_import
     (out / "half").touch()
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(60)
 
-synthetic.write_synthetic_capture = write
+sys.modules["hnerf.synthetic"] = SimpleNamespace(write_synthetic_capture=write)  # without what it imports
 sys.exit(main(sys.argv[1:]))
 """
 
