@@ -155,9 +155,10 @@ def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: 
 def test_check_prints_every_camera_and_the_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("hnerf.calibration.report.draw_evidence", lambda *_: None)  # seconds
+    for drawn in ("cameras", "evidence"):  # seconds
+        monkeypatch.setattr(f"hnerf.calibration.report.draw_{drawn}", lambda *_: None)
     capture, preset = shared_capture("valid-wave"), tmp_path / "no-hands.yaml"
-    preset.write_text("based_on: fast\ndetection: {hands: none}\ncapture: {max_frames: 12}\n")
+    preset.write_text("based_on: fast\ndetection: {hands: none}\ncapture: {max_frames: 4, max_side_px: 128}\n")
     assert main(["check-cameras", str(capture), "--store", str(tmp_path), "--preset", str(preset)]) == 0
     lines = capsys.readouterr().out.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.startswith("camera ")) :]
