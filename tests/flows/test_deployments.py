@@ -23,20 +23,15 @@ ROOT = Path(__file__).parent.parent.parent
 PATIENCE_S = 60.0
 
 
-def prefect(api: str, *arguments: str) -> str:
-    environment = os.environ | {"PREFECT_API_URL": api, "COLUMNS": "200"}
-    command = [sys.executable, "-m", "prefect", "--no-prompt", *arguments]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.fixture(scope="module")
 def deployed(prefect_api: str) -> str:
     """Return the API of a server with the deployments of prefect.yaml."""
     with get_client(sync_client=True) as client:
         client.create_work_pool(WorkPoolCreate(name="local", type="process"))
-    prefect(prefect_api, "deploy", "--all")
+    environment = os.environ | {"PREFECT_API_URL": prefect_api}
+    command = [sys.executable, "-m", "prefect", "--no-prompt", "deploy", "--all"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
     return prefect_api
 
 
@@ -57,19 +52,16 @@ def test_cron_deployment_yields_scheduled_runs_five_minutes_apart(deployed: str)
     assert (second - first).total_seconds() == 300
 
 
-def test_deployment_run_takes_a_capture(deployed: str) -> None:
-    prefect(deployed, "deployment", "run", "train-subject/local", "-p", "capture=/recordings/ada")
-    (run,) = runs_of("train-subject")
-    assert run.parameters == {"capture": "/recordings/ada"}
-    assert unfinished_runs() == 1
-
-
-@pytest.mark.parametrize(("flow", "what"), [("benchmark", "study"), ("stability", "study"), ("ablate", "preset")])
-def test_studies_are_deployed_too(deployed: str, flow: str, what: str) -> None:
-    parameters = {"capture": "/recordings/ada", what: "mine"}
+@pytest.mark.parametrize(
+    ("flow", "what"),
+    [("train-subject", "preset"), ("benchmark", "study"), ("stability", "study"), ("ablate", "preset")],
+)
+def test_deployments_take_a_capture_and_what_is_to_be_done(deployed: str, flow: str, what: str) -> None:
+    before, parameters = unfinished_runs(), {"capture": "/recordings/ada", what: "mine"}
     run_deployment(f"{flow}/local", parameters=parameters, timeout=0)
     (run,) = runs_of(flow)
     assert run.parameters == parameters
+    assert unfinished_runs() == before + (flow == "train-subject")
 
 
 def test_forms_of_all_deployments_help_with_every_parameter(deployed: str) -> None:
