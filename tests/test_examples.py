@@ -32,6 +32,8 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("examples") / "person"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("hnerf.fields.fast.TIGHTEN_STEP_M", 0.02)  # of a surface that four steps leave
+        for drawn in ("cameras", "evidence"):  # seconds
+            patched.setattr(f"hnerf.calibration.report.draw_{drawn}", lambda *_: None)
         example("train").main(out, SMALL, [*FEW, *COARSE, "fit.contour_steps=1"])
     return out
 
