@@ -101,7 +101,8 @@ def overlay_surface(image: np.ndarray, surface: Surface, camera: Camera) -> np.n
 def error_map(rendered: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Return the mean absolute difference over channels as colours: black is none, the brightest FULL_ERROR or more."""
     error = np.abs(rendered.astype(np.float32) - reference).mean(-1) / 255
-    return _colour_map(error / FULL_ERROR)
+    levels = ((error / FULL_ERROR).clip(0, 1) * 255).astype(np.uint8)
+    return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
 
 
 @dataclass(frozen=True)
@@ -189,13 +190,6 @@ def _headlight(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarr
 def supersampled(camera: Camera) -> Camera:
     """Return the camera with SUPERSAMPLING times the pixels along each side."""
     return camera.scaled(SUPERSAMPLING)
-
-
-def _colour_map(values: np.ndarray) -> np.ndarray:
-    """Convert values in [0, 1] (...,) to colours (..., 3)."""
-    levels = (values.clip(0, 1) * 255).astype(np.uint8)
-    bgr = cv2.applyColorMap(np.atleast_2d(levels), cv2.COLORMAP_INFERNO)
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).reshape(*levels.shape, 3)
 
 
 def _outline(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
