@@ -53,9 +53,11 @@ HOSTILE = "<script>alert(1)</script>"
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse_meshes() -> Iterator[None]:
-    """Extract surfaces on a grid that is coarse, but fine enough for figures worked out by hand."""
+    """Extract surfaces on a grid that is coarse, but fine enough for figures worked out by hand; draw small pictures of
+    them, which nobody looks at here."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("hnerf.avatar.surface.POSED_CELLS", 96)
+        patched.setattr("hnerf.evaluation.pictures.PICTURE_PX", (75, 100))
         yield
 
 
