@@ -26,6 +26,7 @@ while len((Path(store) / "calls").read_text().split()) < 2:
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checkout:
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # else a program rewritten in the same second runs as it was
+    monkeypatch.setattr(module, "POLL_S", 0.02)
     return Checkout(tmp_path)
 
 
