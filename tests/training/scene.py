@@ -15,9 +15,11 @@ from hnerf.fields import fast
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
 from hnerf.render import trajectory
-from hnerf.training import fixed_rays
+from hnerf.training import fixed_rays, parts
+from hnerf.training.distributed import Distributed
 from tests.body.boxes import box_rig
 
+ALONE = Distributed(0, 1, torch.device("cpu"))
 SIZE_PX = 32
 FRAMES = (0, 1, 2)
 
@@ -34,6 +36,9 @@ TINY_FIELDS = {
         "shell_cell_m": 0.05,
     },
     "paper": {"kind": "paper", "samples": 4},
+    "nerf": {"kind": "nerf", "samples": 4, "width": 8},
+    "idr": {"kind": "idr", "samples": 4, "width": 8},
+    "nerfies": {"kind": "nerfies", "samples": 4, "width": 8, "deformation_width": 8},
 }
 TINY = TrainingSettings.model_validate(
     {
@@ -49,19 +54,19 @@ TINY = TrainingSettings.model_validate(
 )
 
 # For trainings of a dozen steps. They leave no surface worth judging, so few rays are rendered for the check and the
-# held-out PSNR; and the shell is tightened in coarse steps.
+# held-out PSNR; the shell is tightened in coarse steps; and the memory of a ray is told from small batches.
 SHRUNK_CONSTANTS: tuple[tuple[ModuleType, str, float], ...] = (
     (fixed_rays, "MIN_PERSON_COVERAGE", 0.0),
     (fixed_rays, "RAYS", 64),
     (fast, "TIGHTEN_STEP_M", 0.02),
+    (parts, "FEW_RAYS", 4),
+    (parts, "MORE_RAYS", 8),
 )
 
 
 def tiny(kind: str = "fast", **changes: object) -> TrainingSettings:
     """Return the smallest settings of a kind of field, with changes."""
-    return TrainingSettings.model_validate(
-        TINY.model_dump() | {"field": TINY_FIELDS.get(kind, {"kind": kind})} | changes
-    )
+    return TrainingSettings.model_validate(TINY.model_dump() | {"field": TINY_FIELDS[kind]} | changes)
 
 
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:

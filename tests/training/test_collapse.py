@@ -8,28 +8,29 @@ import pytest
 import torch
 from torch import nn
 
+from hnerf.fields import fast
 from hnerf.fields.base import Field
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
 from hnerf.training import fixed_rays
-from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer
-from tests.training.scene import record, tiny
+from tests.training.scene import ALONE, record, tiny
 
 FAR = 10.0  # units of the residual's last layer: metres away in either field
 
 
 @pytest.fixture(autouse=True)
 def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An eighth of the rays tells empty from full."""
-    monkeypatch.setattr(fixed_rays, "RAYS", 256)
+    """A few rays tell empty from full, whatever the steps in which the shell is tightened."""
+    monkeypatch.setattr(fixed_rays, "RAYS", 128)
+    monkeypatch.setattr(fast, "TIGHTEN_STEP_M", 0.02)
 
 
 def trainer_of(folder: Path, kind: str) -> Trainer:
     """Return a trainer that takes two steps."""
     settings = tiny(kind, steps=2, novel_pose_steps=0)
-    return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
+    return Trainer(*record(folder / "capture"), settings, folder, ALONE)
 
 
 def move_surface(field: Field, outwards: float) -> None:

@@ -23,8 +23,8 @@ WITH_GPU = torch.cuda.is_available()
 @pytest.mark.parametrize("kind", ["fast", "paper", "nerf", "idr", "nerfies"])
 def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str):
     capture, masks, body = record(tmp_path / "capture")
-    camera = capture.cameras[capture.train_cameras[0]]
-    changes: dict[str, object] = {"one_posture": False, "steps": 2, "novel_pose_steps": 1}
+    camera = capture.cameras[capture.train_cameras[0]].scaled(0.5)
+    changes: dict[str, object] = {"one_posture": False, "steps": 2, "novel_pose_steps": 1, "rays_per_frame": 16}
     if kind not in ("fast", "paper"):
         changes["pose_learning_rate"] = 0.0
     if kind in ("nerf", "idr"):

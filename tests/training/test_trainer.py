@@ -19,14 +19,10 @@ from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import InputError
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint, training_key
-from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import PixelRays, Pixels
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer, train
-from tests.training.scene import FRAMES, TINY, record, tiny
-
-ALONE = Distributed(0, 1, torch.device("cpu"))
-
+from tests.training.scene import ALONE, FRAMES, TINY, record, tiny
 
 pytestmark = pytest.mark.usefixtures("any_surface")
 
@@ -36,7 +32,7 @@ def test_interrupted_training_ends_as_if_it_was_not(tmp_path: Path, monkeypatch:
     """What there is after ten steps, resumed from the checkpoint at six: the same weights, poses and losses, bit by
     bit."""
     recording = record(tmp_path / "capture")
-    settings = tiny(kind)
+    settings = tiny(kind, rays_per_frame=16)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     whole.mkdir()
     optimise = Trainer._optimise
@@ -61,16 +57,16 @@ def test_interrupted_training_ends_as_if_it_was_not(tmp_path: Path, monkeypatch:
     assert losses[0] == losses[1]
 
 
-@pytest.mark.parametrize("novel_pose_steps", [0, 4])
+@pytest.mark.parametrize("novel_pose_steps", [0, 1])
 def test_a_finished_training_that_was_stopped_before_its_files_were_safe_only_writes_them_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, novel_pose_steps: int
 ) -> None:
-    recording, settings = record(tmp_path / "capture"), tiny(steps=11, novel_pose_steps=novel_pose_steps)
+    recording, settings = record(tmp_path / "capture"), tiny(steps=2, novel_pose_steps=novel_pose_steps)
     first = train(*recording, settings, tmp_path, ALONE)
     written = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
     monkeypatch.delattr(Trainer, "_optimise")  # no step is taken
     again = train(*recording, settings, tmp_path, ALONE)
-    assert again["steps"] == first["steps"] == 11 + novel_pose_steps
+    assert again["steps"] == first["steps"] == 2 + novel_pose_steps
     kept = {name for name, content in written.items() if (tmp_path / name).read_bytes() == content}
     assert written.keys() - kept <= {"report.json"}  # setup took another time
 
@@ -97,7 +93,8 @@ def test_overfits_the_column(tmp_path: Path):
 def test_the_paper_learns_by_its_nine_losses_and_fog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """With the preset's weights, on the same batch repeatedly, so that random batches do not hide what is learned."""
     losses = load_settings("paper").training.losses
-    settings = tiny(field={"kind": "paper", "samples": 16}, losses=losses, steps=15, novel_pose_steps=0)
+    few = {"steps": 15, "novel_pose_steps": 0, "rays_per_frame": 32}
+    settings = tiny(field={"kind": "paper", "samples": 16}, losses=losses, **few)
     trainer = Trainer(*record(tmp_path / "capture"), settings, tmp_path, ALONE)
 
     def optimise_the_same(module: torch.nn.Module) -> dict[str, torch.Tensor]:
@@ -152,7 +149,7 @@ def test_time_ends_the_field_and_slows_it_down(tmp_path: Path, monkeypatch: pyte
 
 def test_a_snapshot_is_a_subject(tmp_path: Path):
     capture, masks, body = record(tmp_path / "capture")
-    Trainer(capture, masks, body, tiny(snapshots_s=[1e-6]), tmp_path, ALONE).run()
+    Trainer(capture, masks, body, tiny(snapshots_s=[1e-6], steps=2, novel_pose_steps=0), tmp_path, ALONE).run()
     early, late = load_avatar(tmp_path / "snapshots" / "1e-06"), load_avatar(tmp_path)
     assert early.field.log_sharpness != late.field.log_sharpness
     assert early.render(capture.cameras["0"], early.body.theta[0], early.body.root[0]).alpha.max() > 0.5
@@ -192,7 +189,7 @@ def test_novel_pixels_never_reach_the_field(tmp_path: Path):
         if steps:
             for path in (out / "capture" / "images").glob(f"*/{FRAMES[2]:06d}.png"):
                 assert cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
-        train(capture, masks, body, tiny(novel_pose_steps=steps), out, ALONE)
+        train(capture, masks, body, tiny(steps=6, novel_pose_steps=steps), out, ALONE)
         models.append(load_file(out / "model.safetensors"))
     deformations = [model.pop("deformation.displacement") for model in models]
     assert all(torch.equal(models[0][name], models[1][name]) for name in models[0])
