@@ -9,10 +9,7 @@ from torch import nn
 from hnerf.avatar.model_file import load_field, write_field
 from hnerf.errors import InputError
 from hnerf.fields.sparse_grids import SparseGrids
-
-
-def everywhere(nodes_m: torch.Tensor, beyond_m: float) -> torch.Tensor:
-    return torch.ones(len(nodes_m), dtype=torch.bool)
+from tests.fields.plain_grids import everywhere
 
 
 def small_field(cells: int = 4) -> nn.Module:

@@ -14,13 +14,11 @@ from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks, encode
 from hnerf.config import TrainingSettings
 from hnerf.geometry.camera import Camera
-from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
-from tests.training.scene import SIZE_PX, look_at
+from tests.training.scene import ALONE, SIZE_PX, look_at
 
 MIDDLE_M, RADIUS_M = np.full(3, 0.5), 0.35
-ALONE = Distributed(0, 1, torch.device("cpu"))
 RING = tuple("01234567")  # every 45 degrees
 
 

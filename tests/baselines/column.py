@@ -11,10 +11,9 @@ from hnerf.avatar.trained import TrainedAvatar, load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
-from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
-from tests.training.scene import record
+from tests.training.scene import ALONE, record
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ def learn(folder: Path, settings: TrainingSettings, bends_rad: tuple[float, floa
     """Train on the column bent as in the first two frames; the third is a novel pose."""
     capture, masks, body = record(folder / "capture", bends_rad)
     (folder / "out").mkdir()
-    train(capture, masks, body, settings, folder / "out", Distributed(0, 1, torch.device("cpu")))
+    train(capture, masks, body, settings, folder / "out", ALONE)
     return Learned(capture, body, load_avatar(folder / "out"))
 
 

@@ -4,6 +4,11 @@ import torch
 from torch import Tensor, nn
 
 
+def everywhere(nodes_m: Tensor, beyond_m: float) -> Tensor:
+    """Return that something is to be learned at all nodes, for SparseGrids."""
+    return torch.ones(len(nodes_m), dtype=torch.bool)
+
+
 class FeatureGrids(nn.Module):
     """Dense feature grids of several resolutions over a box, trilinearly interpolated and concatenated; features start
     at zero and stay zero where nothing is learned.

@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from hnerf.config import FastFieldSettings
 from hnerf.fields.grids import CanonicalField
+from tests.fields.plain_grids import everywhere
 
 SETTINGS = FastFieldSettings(
     outer_m=0.05, geometry_cells=(1, 2), colour_cells=(1,), channels=1, width=4, pose_width=2, samples=1
@@ -13,10 +14,6 @@ Y, D = torch.tensor([[0.2, 0.3, 0.4]]), torch.tensor([-0.01])
 NORMAL = torch.tensor([[1.0, 0.0, -0.5]])
 POSE = torch.tensor([[7.0, 8.0, 9.0], [0.1, 0.2, 0.3]]), torch.tensor([1])  # of two rows, and which
 CODE = [0.3, -0.2]  # of this row's pose: its last number, and less its second one
-
-
-def everywhere(nodes_m: Tensor, beyond_m: float) -> Tensor:
-    return torch.ones(len(nodes_m), dtype=torch.bool)
 
 
 class First(nn.Module):

@@ -4,15 +4,11 @@ import torch
 from torch import Tensor
 
 from hnerf.fields.sparse_grids import SparseGrids
-from tests.fields.plain_grids import FeatureGrids
+from tests.fields.plain_grids import FeatureGrids, everywhere
 
 LOWER_M, UPPER_M, CELLS, CHANNELS = torch.zeros(3), torch.tensor([1.0, 2.0, 1.5]), (3, 8), 4
 ON_BORDERS = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 1.5], [0.5, 7.0, 0.3], [-1.0, 0.2, 1.5]])
 POINTS = torch.cat([torch.rand(200, 3, generator=torch.Generator().manual_seed(1)) * UPPER_M, ON_BORDERS])
-
-
-def everywhere(nodes_m: Tensor, beyond_m: float) -> Tensor:
-    return torch.ones(len(nodes_m), dtype=torch.bool)
 
 
 def low(nodes_m: Tensor, beyond_m: float) -> Tensor:

@@ -15,12 +15,10 @@ from hnerf.capture.masks import Masks, encode
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.reach import everywhere
 from hnerf.training import exposure
-from hnerf.training.distributed import Distributed
 from hnerf.training.exposure import _vertex_colours, _visible_vertices, camera_gains, solve_gains
 from hnerf.training.gather import gather_pixels
-from tests.training.scene import TINY, look_at, record
+from tests.training.scene import ALONE, TINY, look_at, record
 
-ALONE = Distributed(0, 1, torch.device("cpu"))
 BALL = trimesh.creation.icosphere(subdivisions=5)  # 10242 vertices 1 m around the origin
 RING = {name: look_at(name, 4.0 * np.array([x, y, 0]), np.zeros(3)).resized(128, 128)
         for name, x, y in [("a", 1, 0), ("b", 0, 1), ("c", -1, 0), ("d", 0, -1)]}  # fmt: skip

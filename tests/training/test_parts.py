@@ -13,9 +13,9 @@ from hnerf.training.distributed import Distributed
 from hnerf.training.parts import GIB, PEAK_FACTOR, USABLE_SHARE, Parts, decide_parts
 from hnerf.training.pixels import PixelRays
 from tests.training.first_step import gradients, untrained
+from tests.training.scene import ALONE
 
 CPU = torch.device("cpu")
-ALONE = Distributed(0, 1, CPU)
 
 
 class Scale(nn.Module):

@@ -14,15 +14,13 @@ from hnerf.capture.masks import encode
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import ReachablePixels, everywhere, within_box, within_reach
 from hnerf.training import gather
-from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 from hnerf.training.pixels import Pixels
 from hnerf.training.plates import plates_of
-from tests.training.scene import SIZE_PX, record
+from tests.training.scene import ALONE, SIZE_PX, record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
 AFAR = dataclasses.replace(AHEAD, K=np.diag([5000.0, 5000.0, 1.0]))  # its rays are all but parallel
-ALONE = Distributed(0, 1, torch.device("cpu"))
 REACHED = functools.partial(within_reach, reach_m=0.2)
 
 

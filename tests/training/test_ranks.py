@@ -11,12 +11,9 @@ import pytest
 import torch
 
 from hnerf.training.checkpoint import NAME
-from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.training.first_step import KINDS, gradients, untrained
-from tests.training.scene import TINY, record
-
-ALONE = Distributed(0, 1, torch.device("cpu"))
+from tests.training.scene import ALONE, TINY, record
 
 
 @pytest.fixture(scope="module")

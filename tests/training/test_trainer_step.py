@@ -12,10 +12,9 @@ from hnerf.fields.conditions import Draws
 from hnerf.fields.rays import PosedScene
 from hnerf.training import trainer as trainer_module
 from hnerf.training.auto_settings import Decision
-from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import PixelRays
 from hnerf.training.trainer import Trainer
-from tests.training.scene import TINY, record, tiny
+from tests.training.scene import ALONE, TINY, record, tiny
 
 H_NERF = pytest.mark.parametrize("kind", ["fast", "paper"])
 
@@ -39,7 +38,7 @@ class Listener(torch.nn.Module):
 def trainer_of(folder: Path, cameras: tuple[str, ...] = ("0", "1", "2", "3"), **changes: Any) -> Trainer:
     capture, masks, body = record(folder / "capture")
     capture = dataclasses.replace(capture, train_cameras=cameras)
-    return Trainer(capture, masks, body, tiny(**changes), folder, Distributed(0, 1, torch.device("cpu")))
+    return Trainer(capture, masks, body, tiny(**changes), folder, ALONE)
 
 
 def handed_over(trainer: Trainer) -> Listener:
