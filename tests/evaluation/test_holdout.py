@@ -102,7 +102,9 @@ def test_figures_are_gathered_by_camera_with_their_mean(tmp_path: Path) -> None:
     assert "has test cameras" in collect_held_out(with_test_camera, [])["holdout_reason"]
 
 
-def test_the_report_has_a_row_for_each_camera(tmp_path: Path) -> None:
+def test_the_report_has_a_row_for_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hnerf.avatar.surface.POSED_CELLS", 96)  # of its surfaces nobody looks at anything here
+    monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (75, 100))
     capture = three_cameras(tmp_path / "capture")
     folders = [held_out(tmp_path, capture, camera)[0] for camera in ("a", "b")]
     inputs = replace(ball_inputs(capture, tmp_path / "stages"), held_out_folders=tuple(folders))

@@ -137,6 +137,7 @@ def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_
     assert (trainer.scene.region.cells == 1).sum() < 0.7 * cells
 
 
+@pytest.mark.usefixtures("any_surface")
 @H_NERF
 def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, kind: str) -> None:
     """After a bend of 0.1 and a move of 1 cm are absorbed, the conditions include them and the correction is zero.
@@ -157,6 +158,7 @@ def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, kind: str) -> N
     assert trainer.scene.bodies.root[0, :3, 3].tolist() == pytest.approx([0, 0, moved_m[0]], abs=1e-5)
 
 
+@pytest.mark.usefixtures("any_surface")
 @H_NERF
 def test_one_camera_keeps_the_fits_mean_distance(tmp_path: Path, kind: str) -> None:
     """Two bodies stand at the origin, L from the camera at c. The first learns to stand at 1.1 L: the mean is 1.05 L,

@@ -75,6 +75,7 @@ def scored(
     out.mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scoring, "load_avatar", lambda path, device: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
+        patch.setattr("hnerf.avatar.surface.POSED_CELLS", 96)  # enough for a ball
         return score(scene(capture), training, settings, out)
 
 
