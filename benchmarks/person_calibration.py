@@ -26,7 +26,6 @@ from hnerf.calibration.diagnosis import body_height_m, measure
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
 from hnerf.calibration.refine import Refinement, refine
-from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.subject import subject_keypoints
@@ -107,11 +106,7 @@ def _score(capture: Capture, reference: list[Camera], known: bool) -> dict[str, 
     unknown = [] if known else list(lost)
     started = time.process_time()
     found = calibrate_from_person(
-        capture.with_cameras(lost),
-        unknown,
-        dict.fromkeys(lost, "given"),
-        body_height_m(of_reference.points_m),
-        Outlines.of,
+        capture.with_cameras(lost), unknown, dict.fromkeys(lost, "given"), body_height_m(of_reference.points_m)
     )
     seconds = time.process_time() - started
     turns_deg, moves_m = errors(found.cameras, reference)

@@ -109,7 +109,7 @@ def adjust_shared_lens(
     adjusted, k1 = list(cameras), 0.0
     for _ in range(ROUNDS):
         projections = np.stack([camera.projection for camera in adjusted])
-        points_m, residuals_px, used = triangulate(projections, undistort(flat, adjusted, shared, k1))
+        points_m, residuals_px, used = triangulate(projections, undistort(flat, adjusted, unknown, k1))
         if used.sum() < MIN_OBSERVATIONS:
             break
         scale_px = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))
@@ -117,13 +117,13 @@ def adjust_shared_lens(
     return align(adjusted, cameras), k1
 
 
-def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], shared: np.ndarray, k1: float) -> np.ndarray:
-    """Return keypoints (C, K, 3) without the distortion k1 (OpenCV's) of the cameras in `shared` (C,)."""
+def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], unknown: Sequence[str], k1: float) -> np.ndarray:
+    """Return keypoints (C, ..., 3) without the distortion k1 (OpenCV's) of the cameras named in `unknown`."""
     straight = keypoints.copy()
     for i, camera in enumerate(cameras):
-        if not (shared[i] and k1):
+        if camera.name not in unknown or not k1:
             continue
-        seen = keypoints[i, :, 2] > 0
+        seen = keypoints[i, ..., 2] > 0
         straight[i, seen] = undistort_keypoints(keypoints[i, seen], camera.K, np.array([k1, 0, 0, 0]))
     return straight
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,19 +104,14 @@ class PersonCalibration:
 
 
 def calibrate_from_person(
-    capture: Capture,
-    unknown_focal: Sequence[str],
-    intrinsics: dict[str, str],
-    height_m: float | None,
-    outlines_of: Callable[[Capture, int], Outlines | None],
+    capture: Capture, unknown_focal: Sequence[str], intrinsics: dict[str, str], height_m: float | None
 ) -> PersonCalibration:
     """Calibrate the training cameras of a capture from its keypoints and outlines; the poses of its cameras are not
     read.
 
     unknown_focal: cameras whose focal length is a guess, to be estimated; intrinsics: where each camera's come from, in
-    words; height_m: the person's, the mean stature if None; outlines_of: how outlines of a number of frames are found.
-    Lenses with distortion are left as keypoints have them. Raises InputError where the recording does not determine the
-    cameras.
+    words; height_m: the person's, the mean stature if None. Lenses with distortion are left as keypoints have them.
+    Raises InputError where the recording does not determine the cameras.
     """
     if len(capture.train_cameras) < 2:
         raise InputError(f"{capture.name}: one camera cannot be calibrated from the person; film with two or more")
@@ -128,13 +123,13 @@ def calibrate_from_person(
         agreed = subject_keypoints(capture.with_cameras(capture.cameras | {c.name: c for c in rig}))
         keypoints = np.stack([agreed[name] for name in capture.train_cameras])
         fit, held_out_px = fit_lenses(rig, keypoints, unknown_focal, min_improvement)
-        straight = _straight(keypoints, fit, unknown_focal)
+        straight = undistort(keypoints, fit.cameras, unknown_focal, fit.k1)
         found = measure(fit.cameras, straight)
         _check_determined(fit.cameras, found, straight, unknown_focal)
         height = height_m or MEAN_STATURE_M
         scaled, points_m = scale_to(fit.cameras, found.points_m, height)
         if fit.k1 == 0:
-            outlines = outlines_of(capture.with_cameras(capture.cameras | {c.name: c for c in scaled}), FRAMES)
+            outlines = Outlines.of(capture.with_cameras(capture.cameras | {c.name: c for c in scaled}), FRAMES)
             followed, _ = follow_outlines(
                 outlines, scaled, capture.train_cameras, points_m, min_improvement, unknown_focal
             )
@@ -166,13 +161,6 @@ def _each_alone(capture: Capture) -> np.ndarray:
     if point := capture.subject_point:
         found |= subject_keypoints(dataclasses.replace(capture, train_cameras=(point.camera,)))
     return np.stack(list(found.values()))
-
-
-def _straight(keypoints: np.ndarray, fit: LensFit, unknown: Sequence[str]) -> np.ndarray:
-    """Return keypoints (C, frames, 25, 3) without the distortion that was found."""
-    shared = np.array([camera.name in unknown for camera in fit.cameras])
-    flat = keypoints.reshape(len(keypoints), -1, 3)
-    return undistort(flat, fit.cameras, shared, fit.k1).reshape(keypoints.shape)
 
 
 def _check_determined(

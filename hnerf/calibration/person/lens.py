@@ -11,6 +11,7 @@ from hnerf.calibration.diagnosis import held_out_parts, trimmed_cost_px
 from hnerf.geometry.camera import Camera
 
 log = logging.getLogger("hnerf.calibration")
+Fit = Callable[[list[Camera], np.ndarray], tuple[list[Camera], float]]  # of a rig to keypoints: cameras and k1
 
 
 class LensFit(NamedTuple):
@@ -33,10 +34,10 @@ def fit_lenses(
     """
     if not unknown:
         return LensFit(adjust(cameras, keypoints, [camera.name for camera in cameras]), 0.0, ""), {}
-    fits: dict[str, Callable[[list[Camera], np.ndarray], LensFit]] = {
-        "one focal length": lambda rig, seen: _shared(rig, seen, unknown, False),
-        "one focal length, one distortion": lambda rig, seen: _shared(rig, seen, unknown, True),
-        "a focal length each": lambda rig, seen: _own(rig, seen, unknown),
+    fits: dict[str, Fit] = {
+        "one focal length": lambda rig, seen: adjust_shared_lens(rig, seen, unknown, False),
+        "one focal length, one distortion": lambda rig, seen: adjust_shared_lens(rig, seen, unknown, True),
+        "a focal length each": lambda rig, seen: (_own(rig, seen, unknown), 0.0),
     }
     costs_px = {what: _held_out_px(cameras, keypoints, unknown, fit) for what, fit in fits.items()}
     for what, cost_px in costs_px.items():
@@ -45,30 +46,19 @@ def fit_lenses(
     for what in list(fits)[1:]:
         if costs_px[what] < (1 - min_improvement) * costs_px[chosen]:
             chosen = what
-    return fits[chosen](cameras, keypoints)._replace(what=chosen), costs_px
+    return LensFit(*fits[chosen](cameras, keypoints), chosen), costs_px
 
 
-def _shared(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence[str], distorted: bool) -> LensFit:
-    found, k1 = adjust_shared_lens(cameras, keypoints, unknown, distorted)
-    return LensFit(found, k1, "")
-
-
-def _own(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence[str]) -> LensFit:
+def _own(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence[str]) -> list[Camera]:
     start, _ = adjust_shared_lens(cameras, keypoints, unknown, False)
-    return LensFit(adjust(start, keypoints, [camera.name for camera in cameras], unknown), 0.0, "")
+    return adjust(start, keypoints, [camera.name for camera in cameras], unknown)
 
 
-def _held_out_px(
-    cameras: list[Camera],
-    keypoints: np.ndarray,
-    unknown: Sequence[str],
-    fit: Callable[[list[Camera], np.ndarray], LensFit],
-) -> float:
+def _held_out_px(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence[str], fit: Fit) -> float:
     """Return the trimmed cost of keypoints that share neither frames nor joints with those fitted to."""
     costs_px = []
     for fitted, judged in held_out_parts(keypoints):
-        found = fit(cameras, fitted)
-        shared = np.array([camera.name in unknown for camera in cameras])
-        straight = undistort(judged.reshape(len(cameras), -1, 3), found.cameras, shared, found.k1)
-        costs_px.append(trimmed_cost_px(found.cameras, straight))
+        found, k1 = fit(cameras, fitted)
+        straight = undistort(judged, found, unknown, k1)
+        costs_px.append(trimmed_cost_px(found, straight.reshape(len(cameras), -1, 3)))
     return float(np.mean(costs_px))

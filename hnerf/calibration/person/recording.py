@@ -4,7 +4,6 @@ import tempfile
 from pathlib import Path
 
 from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
-from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.ingest import ingest
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
@@ -28,4 +27,4 @@ def calibrate_recording(
         capture = with_keypoints(capture, Path(scratch) / "detected")
         sources = {name: known.source for name, known in layout.known_lenses.items()}
         unknown = [name for name, source in sources.items() if not source]
-        return calibrate_from_person(capture, unknown, sources, height_m or capture.stature_m, Outlines.of)
+        return calibrate_from_person(capture, unknown, sources, height_m or capture.stature_m)

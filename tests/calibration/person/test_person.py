@@ -14,7 +14,8 @@ from hnerf.calibration.person.calibrate import _as_recorded, _each_alone, _motio
 from hnerf.calibration.person.lens import fit_lenses
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import scale_to, stand_on_ground
-from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.calibration.silhouettes import Outlines
+from hnerf.capture.capture import SubjectPoint
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -28,8 +29,10 @@ def lost(camera: Camera) -> Camera:
     return dataclasses.replace(camera, R=np.eye(3), t_m=np.zeros(3))
 
 
-def no_outlines(capture: Capture, frames: int) -> None:
-    """Stand in for what finds outlines, of captures without images."""
+@pytest.fixture(autouse=True)
+def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Find no outlines in captures without images."""
+    monkeypatch.setattr(Outlines, "of", lambda *_: None)
 
 
 def worst_errors(cameras: list[Camera], truth: list[Camera]) -> tuple[float, float]:
@@ -92,7 +95,7 @@ def test_a_distortion_is_found_where_held_out_keypoints_show_it() -> None:
 def test_undistort_inverts_k1_by_hand() -> None:
     camera = Camera("a", np.diag([100.0, 100, 1]), np.eye(3), np.zeros(3), 100, 100)
     seen = np.array([[[100 * 0.5 * (1 + 0.1 * 0.25), 0, 1.0], [7, 7, 0]]])  # x = 0.5, r^2 = 0.25, k1 = 0.1
-    straight = undistort(seen, [camera], np.array([True]), 0.1)
+    straight = undistort(seen, [camera], ["a"], 0.1)
     assert straight[0, 0, 0] == pytest.approx(50, abs=0.01)
     assert straight[0, 1].tolist() == [7, 7, 0]
 
@@ -101,7 +104,7 @@ def test_undistort_inverts_a_wide_lens_in_the_corner() -> None:
     """The corner (0.9, 0.5) focal lengths off the axis, r^2 = 1.06: with k1 = -0.2 it is seen at 1 - 0.212 of that."""
     camera = Camera("01", np.array([[1000.0, 0, 900], [0, 1000, 500], [0, 0, 1]]), np.eye(3), np.zeros(3), 1801, 1001)
     seen = np.array([[[900 + 0.788 * 900, 500 + 0.788 * 500, 1.0]]])
-    straight = undistort(seen, [camera], np.array([True]), -0.2)
+    straight = undistort(seen, [camera], ["01"], -0.2)
     np.testing.assert_allclose(straight[0, 0], [1800, 1000, 1], atol=0.02)
 
 
@@ -145,7 +148,7 @@ def test_frames_of_one_step_count_as_one_at_any_rate() -> None:
 def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) -> None:
     truth = ring(4)
     capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
-    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M, no_outlines)
+    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M)
     turn_deg, move_m = worst_errors(found.cameras, truth)
     assert turn_deg < 0.3 and move_m < 0.02
     spread = [np.linalg.norm(a.centre_m - b.centre_m) for a, b in pairwise(found.cameras)]
@@ -167,10 +170,9 @@ def test_outlines_have_the_last_word_on_poses(tmp_path: Path, monkeypatch: pytes
         assert outlines == "found" and others[-1] == ["c0"]
         return [turned(camera, 0.5) if camera.name == "c1" else camera for camera in cameras], "gained"
 
+    monkeypatch.setattr(Outlines, "of", lambda *_: "found")
     monkeypatch.setattr("hnerf.calibration.person.calibrate.follow_outlines", follow)
-    found = calibrate_from_person(
-        capture, ["c0"], dict.fromkeys(capture.cameras, "given"), STATURE_M, lambda *_: "found"
-    )  # type: ignore[arg-type, return-value]
+    found = calibrate_from_person(capture, ["c0"], dict.fromkeys(capture.cameras, "given"), STATURE_M)
     assert worst_errors(found.cameras, [turned(c, 0.5) if c.name == "c1" else c for c in truth])[0] < 0.1
 
 
@@ -185,14 +187,14 @@ def test_the_rate_and_the_stride_of_a_recording_count(tmp_path: Path, monkeypatc
         return stand_on_ground(cameras, points_m, frame_s)
 
     monkeypatch.setattr("hnerf.calibration.person.calibrate.stand_on_ground", stood)
-    calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M, no_outlines)
+    calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M)
     assert asked == [pytest.approx(0.05)]
 
 
 def test_without_a_height_the_mean_is_taken_and_said(tmp_path: Path) -> None:
     truth = ring(3)
     capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
-    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), None, no_outlines)
+    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), None)
     assert found.scale_sd == pytest.approx(np.hypot(0.03, 0.09 / 1.65))
     assert found.notes()[0] == "scale: a person of 1.65 m, the mean of adults (give --height), +- 6 %"
 
@@ -209,7 +211,7 @@ def test_a_lens_is_of_the_recorded_pictures(tmp_path: Path) -> None:
 def refusal(tmp_path: Path, cameras: list[Camera], seen: dict[str, np.ndarray], unknown: list[str]) -> str:
     capture = write_capture(tmp_path, [lost(camera) for camera in cameras], seen)
     with pytest.raises(InputError) as refused:
-        calibrate_from_person(capture, unknown, dict.fromkeys(capture.cameras, ""), 1.8, no_outlines)
+        calibrate_from_person(capture, unknown, dict.fromkeys(capture.cameras, ""), 1.8)
     return str(refused.value)
 
 
