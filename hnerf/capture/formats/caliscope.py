@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from hnerf.capture.formats.easymocap import EasyMocap
-from hnerf.capture.formats.pose2sim import lens_from_table
-from hnerf.capture.lens import Lens, by_name, known_size
+from hnerf.capture.formats.pose2sim import lenses_from_tables
+from hnerf.capture.lens import Lens, known_size
 from hnerf.capture.safe_io import path_in_capture, read_toml
 from hnerf.errors import InputError
 
@@ -32,11 +32,7 @@ class Caliscope(EasyMocap):
         """Return every camera that the file calibrates and does not ignore."""
         caliscope = path_in_capture(self.folder, "camera_array.toml")
         path = caliscope if caliscope.exists() else path_in_capture(self.folder, "calibration.toml")
-        tables = _caliscope_tables(path) if path == caliscope else _aniposelib_tables(path)
-        lenses = [lens_from_table(path, key, table) for key, table in tables.items()]
-        if not lenses:
-            raise InputError(f"{path}: calibrates no camera; calibrate again")
-        return by_name(lenses, path)
+        return lenses_from_tables(path, _caliscope_tables(path) if path == caliscope else read_toml(path))
 
 
 def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
@@ -80,8 +76,3 @@ def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:
         for key, table in cameras.items()
         if not table.get("ignore", False)
     }
-
-
-def _aniposelib_tables(path: Path) -> dict[str, Any]:
-    """Return the tables of cameras."""
-    return {key: table for key, table in read_toml(path).items() if key != "metadata"}

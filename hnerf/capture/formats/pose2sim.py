@@ -26,11 +26,7 @@ class Pose2Sim(Layout):
         files = [p for p in files_in(self.folder, "calibration") if p.match("Calib*.toml")]
         if len(files) != 1:
             raise InputError(f"{self.folder / 'calibration'}: {len(files)} files Calib*.toml; leave exactly one")
-        tables = {key: table for key, table in read_toml(files[0]).items() if key != "metadata"}
-        if not tables:
-            raise InputError(f"{files[0]}: calibrates no camera; calibrate again")
-        lenses = (lens_from_table(files[0], key, table) for key, table in tables.items())
-        return by_name(lenses, files[0])
+        return lenses_from_tables(files[0], read_toml(files[0]))
 
     def footage(self, camera: str) -> Footage:
         """Return videos/<camera>.mp4."""
@@ -45,6 +41,15 @@ class Pose2Sim(Layout):
 def _natural_order(path: Path) -> list[str | int]:
     """Return a key that sorts walk_9 before walk_10."""
     return [int(part) if i % 2 else part for i, part in enumerate(re.split("([0-9]+)", path.stem))]
+
+
+def lenses_from_tables(source: Path, tables: dict[str, Any]) -> dict[str, Lens]:
+    """Return the lenses in a file's tables of cameras, by name; its table `metadata` is none. Raises InputError where
+    there are none, or as `lens_from_table` does."""
+    lenses = [lens_from_table(source, key, table) for key, table in tables.items() if key != "metadata"]
+    if not lenses:
+        raise InputError(f"{source}: calibrates no camera; calibrate again")
+    return by_name(lenses, source)
 
 
 def lens_from_table(source: Path, key: str, table: Any) -> Lens:
