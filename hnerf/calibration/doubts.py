@@ -31,10 +31,8 @@ TOES, HEELS = (19, 22), (21, 24)
 def check_spread(capture: Capture, keypoints: np.ndarray) -> None:
     """Raise InputError where all keypoints (C, frames, 25, 3) of a camera's person lie on one spot."""
     for name, found in zip(capture.train_cameras, keypoints, strict=True):
-        seen = np.where(found[..., 2:] > 0, found[..., :2], np.nan)
-        seen = seen[np.isfinite(seen).any((1, 2))]
-        heights_px = (np.nanmax(seen, 1) - np.nanmin(seen, 1)).max(-1)
-        if len(seen) and np.median(heights_px) < MIN_PERSON_PX:
+        heights_px = person_heights_px(found[(found[..., 2] > 0).any(1)])
+        if len(heights_px) and np.median(heights_px) < MIN_PERSON_PX:
             raise InputError(
                 f"{capture.name}: camera {name}: keypoints of a person lie within {np.median(heights_px):.1f} px; "
                 "detect them again"
@@ -56,11 +54,11 @@ def doubts(capture: Capture, keypoints: np.ndarray, points_m: np.ndarray | None)
 
 def _not_upright(points_m: np.ndarray, up: str) -> list[str]:
     """Return a doubt if the trunk, from mid-hip to neck, does not point along the world's `up`."""
-    trunk_m = points_m[:, NECK] - points_m[:, MID_HIP]
-    trunk_m = trunk_m[np.isfinite(trunk_m).all(1)]
-    if not len(trunk_m):
+    trunk = _direction(points_m[:, MID_HIP], points_m[:, NECK])
+    trunk = trunk[np.isfinite(trunk).all(1)]
+    if not len(trunk):
         return []
-    mean = (trunk_m / np.linalg.norm(trunk_m, axis=1, keepdims=True)).mean(0)
+    mean = trunk.mean(0)
     if mean["xyz".index(up)] > MIN_UPRIGHT_COSINE:
         return []
     axis = int(np.abs(mean).argmax())
