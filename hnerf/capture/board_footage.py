@@ -64,17 +64,18 @@ class BoardDetector:
         if board.dictionary:
             parameters = cv2.aruco.CharucoParameters()
             parameters.minMarkers = 1  # corners beside a hand keep one of their two markers; bad ones are dropped later
-            self.charuco = cv2.aruco.CharucoDetector(_charuco(board), parameters)
+            dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+            size, marker_m = (board.columns, board.rows), board.marker_share * board.square_m
+            squares = cv2.aruco.CharucoBoard(size, board.square_m, marker_m, dictionary)
+            self.charuco = cv2.aruco.CharucoDetector(squares, parameters)
 
     def corners_px(self, rgb: np.ndarray) -> np.ndarray:
         """Return the board's corners in an RGB image, (N, 2), NaN where not seen."""
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         if self.board.inverted:
             grey = 255 - grey
-        return self._checkerboard(grey) if self.charuco is None else self._charuco_corners(grey)
-
-    def _charuco_corners(self, grey: np.ndarray) -> np.ndarray:
-        assert self.charuco is not None
+        if self.charuco is None:
+            return self._checkerboard(grey)
         corners_px = np.full((len(self.board.corners_m), 2), np.nan)
         found, ids, _, _ = self.charuco.detectBoard(grey)
         if ids is not None:
@@ -227,13 +228,6 @@ def _corners(
     if size_px is None:
         raise InputError(f"{pictures.path}: none of its frames is examined; give all cameras the same frames")
     return corners_px, size_px
-
-
-def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
-    """Return the board for OpenCV."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary or ""))
-    size = (board.columns, board.rows)
-    return cv2.aruco.CharucoBoard(size, board.square_m, board.marker_share * board.square_m, dictionary)
 
 
 def _check_markers(source: Path, board: Board) -> None:
