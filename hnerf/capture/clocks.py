@@ -7,7 +7,7 @@ t_own = (1 + drift_ppm / 10^6) t + offset_s.
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -43,16 +43,12 @@ class InStep:
 
     source: ImageFolder | Video
     own: dict[int, float]
+    fps: ClassVar[None] = None  # the rate of the instants is not that of the file
 
     @property
     def path(self) -> Path:
         """Return the path of the footage."""
         return self.source.path
-
-    @property
-    def fps(self) -> float | None:
-        """Return nothing: the rate of the instants is not that of this file."""
-        return None
 
     @property
     def frames(self) -> tuple[int, ...]:
