@@ -58,6 +58,10 @@ def declare_samples(path: Path, count: int) -> None:
     _edit(path, b"stts", lambda _: struct.pack(">IIII", 0, 1, count, 1))
 
 
+def box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", 8 + len(content)) + kind + content
+
+
 def _number(content: bytes, kind: bytes, at: int) -> int:
     """Return the number of 32 bits at a place of the first box of a kind."""
     start = content.index(kind) + 4 + at
@@ -78,6 +82,6 @@ def _edited(content: bytes, wanted: bytes, change: Callable[[bytes], bytes]) -> 
             inner = change(inner)
         elif kind in CONTAINERS:
             inner = _edited(inner, wanted, change)
-        done += struct.pack(">I", len(inner) + 8) + kind + inner
+        done += box(kind, inner)
         at += size
     return done

@@ -7,7 +7,7 @@ import pytest
 from hnerf.capture import boxes
 from hnerf.capture.footage import Video
 from hnerf.errors import InputError
-from tests.capture.mp4 import declare_samples, trim, write_video
+from tests.capture.mp4 import box, declare_samples, trim, write_video
 
 
 @pytest.fixture
@@ -16,10 +16,6 @@ def video(tmp_path: Path) -> Path:
     write_video(tmp_path / "a.mp4", [90] * 3)
     assert len(Video.open(tmp_path / "a.mp4").frames) == 3
     return tmp_path / "a.mp4"
-
-
-def box(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", 8 + len(content)) + kind + content
 
 
 def split(path: Path) -> tuple[bytes, bytes]:

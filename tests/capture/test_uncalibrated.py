@@ -3,7 +3,6 @@
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -14,7 +13,8 @@ from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.capture.video_metadata import KEY, MAX_METADATA_BYTES, focal_35mm
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
-from tests.capture.recordings import write_easymocap
+from tests.capture.mp4 import box
+from tests.capture.recordings import write_easymocap, write_video
 
 
 def write_images(folder: Path, camera: str, exif: Image.Exif | None = None) -> None:
@@ -22,18 +22,6 @@ def write_images(folder: Path, camera: str, exif: Image.Exif | None = None) -> N
     place.mkdir(parents=True)
     for frame in range(2):
         Image.new("RGB", (200, 100)).save(place / f"{frame:06d}.jpg", exif=exif or Image.Exif())
-
-
-def write_video(path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25, (64, 96))
-    for _ in range(3):
-        writer.write(np.full((96, 64, 3), 90, np.uint8))
-    writer.release()
-
-
-def box(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", 8 + len(content)) + kind + content
 
 
 def test_a_field_of_view_gives_the_focal_length(tmp_path: Path) -> None:
@@ -97,8 +85,8 @@ def test_a_lens_file_of_other_cameras_is_refused(tmp_path: Path) -> None:
 
 def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> None:
     folder = tmp_path / "film"
-    write_video(folder / "videos" / "left.mp4")
-    write_video(folder / "videos" / "right.mp4")
+    write_video(folder / "videos" / "left.mp4", 3, (64, 96))
+    write_video(folder / "videos" / "right.mp4", 3, (64, 96))
     assert cameras_without_calibration(folder) == ["left", "right"]
     capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder))
     assert capture.train_cameras == ("left", "right") and len(capture.frames) == 3
@@ -107,13 +95,13 @@ def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> No
 
 def test_images_come_before_a_video_of_the_same_name(tmp_path: Path) -> None:
     write_images(tmp_path, "left")
-    write_video(tmp_path / "left.mp4")
+    write_video(tmp_path / "left.mp4", 3)
     assert Uncalibrated(tmp_path).footage("left").frames == (0, 1)  # the video has three
 
 
 @pytest.mark.parametrize("place", ["", "videos"])
 def test_two_videos_of_one_name_are_refused_and_sound_is_none(tmp_path: Path, place: str) -> None:
-    write_video(tmp_path / place / "ada.mp4")
+    write_video(tmp_path / place / "ada.mp4", 3)
     (tmp_path / place / "ada.wav").touch()
     assert cameras_without_calibration(tmp_path) == ["ada"]
     (tmp_path / place / "ada.MOV").touch()
