@@ -229,12 +229,12 @@ def test_one_side_of_a_calibrated_picture_is_one_line(line: str, folder: Path, t
 
 def test_padding_within_two_percent_is_let_through_and_reported(folder: Path, tmp_path: Path) -> None:
     text = (folder / "intri.yml").read_text()
-    (folder / "intri.yml").write_text(text.replace("W_01: 24", "W_01: 2400").replace("H_01: 16", "H_01: 1600"))
+    (folder / "intri.yml").write_text(text.replace("W_01: 24", "W_01: 240").replace("H_01: 16", "H_01: 160"))
     for frame in rec.FRAMES:
-        write_image(folder / "images" / "01" / f"{frame:06d}.png", np.full((1600, 2352, 3), 9, np.uint8))
-    capture = ingest(folder, CaptureSettings(max_side_px=1176), tmp_path / "out")
-    assert capture.calibrated_sizes_px["01"] == (2400, 1600) and capture.recorded_sizes_px["01"] == (2352, 1600)
-    assert capture.cameras["01"].size_px == (1176, 800)
+        write_image(folder / "images" / "01" / f"{frame:06d}.png", np.full((160, 236, 3), 9, np.uint8))
+    capture = ingest(folder, CaptureSettings(max_side_px=118), tmp_path / "out")
+    assert capture.calibrated_sizes_px["01"] == (240, 160) and capture.recorded_sizes_px["01"] == (236, 160)
+    assert capture.cameras["01"].size_px == (118, 80)
     assert capture.cameras["01"].K[0, 0] == pytest.approx(10.0)  # the calibrated 20, halved with the image
 
 
@@ -278,12 +278,10 @@ def test_videos_are_read_by_frame(tmp_path: Path) -> None:
         assert capture.image("cam02", frame).mean() == pytest.approx(20 + 20 * frame, abs=3)
 
 
-def test_shared_captures_come_through(tmp_path: Path) -> None:
-    folder = shared_capture("valid-wave")
-    capture = ingest(folder, SETTINGS, tmp_path / "out")
-    assert (len(capture.train_frames), len(capture.novel_pose_frames)) == (24, 12)
-    image = cv2.imread(str(folder / "images" / "05" / "000035.jpg"))[..., ::-1]
-    assert np.array_equal(capture.image("05", 35), image)
+def test_shared_captures_come_through(wave: Capture) -> None:
+    assert (len(wave.train_frames), len(wave.novel_pose_frames)) == (24, 12)
+    image = cv2.imread(str(shared_capture("valid-wave") / "images" / "05" / "000035.jpg"))[..., ::-1]
+    assert np.array_equal(wave.image("05", 35), image)
 
 
 def test_the_distance_of_recorded_frames_is_kept(folder: Path, tmp_path: Path) -> None:

@@ -1,13 +1,12 @@
 """Images of strangers: upright whatever their metadata say, and of bounded size."""
 
 import struct
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from peak_memory import peak_mib, reset_peak
 from PIL import Image
 
 from hnerf.capture.capture import Capture
@@ -111,12 +110,8 @@ def test_8k_video_and_narrow_strips_are_not_too_large() -> None:
 
 
 def test_the_largest_image_takes_less_than_500_mb(tmp_path: Path) -> None:
-    """In a process of its own, whose peak tells."""
     Image.new("RGBA", (6000, 6000)).save(tmp_path / "a.png", exif=exif((ORIENTATION, SHORT, 6)), compress_level=1)
-    program = (
-        "import pathlib, re, sys; from hnerf.capture.safe_io import read_image\n"
-        "def peak_kb(): return int(re.search(r'VmHWM:\\s*(\\d+)', pathlib.Path('/proc/self/status').read_text())[1])\n"
-        "before = peak_kb(); read_image(pathlib.Path(sys.argv[1])); print(peak_kb() - before)"
-    )
-    done = subprocess.run([sys.executable, "-c", program, tmp_path / "a.png"], capture_output=True, check=True)
-    assert 1024 * int(done.stdout) < 500_000_000
+    reset_peak()
+    before_mib = peak_mib()
+    read_image(tmp_path / "a.png")
+    assert (peak_mib() - before_mib) << 20 < 500_000_000
