@@ -59,7 +59,7 @@ Read = Callable[[Path, Path], object]  # a folder, and an empty one for results
 
 @dataclass(frozen=True)
 class Reader:
-    """Something that reads files of strangers. write: makes a sound folder; read: reads it."""
+    """Something that reads files of strangers. write: fills an empty folder with sound files; read: reads it."""
 
     name: str
     write: Callable[[Path], object]
@@ -81,7 +81,6 @@ def _photograph(path: Path, rgb: np.ndarray) -> None:
 
 def _easymocap(folder: Path) -> None:
     """Write what an EasyMocap folder can hold: masks, a plate, keypoints of both kinds, capture.toml."""
-    folder.mkdir()
     rec.write_calibration(folder, distortion=(0.1, 0, 0, 0, 0))
     for camera in rec.CAMERAS:
         for frame in range(FRAMES):
@@ -141,13 +140,11 @@ def _boards(folder: Path) -> None:
 
 
 def _zju(folder: Path) -> None:
-    folder.mkdir()
     write_zju(folder)
     write_parameters(folder / "new_params" / "0.npy", np.zeros(72))
 
 
 def _peoplesnapshot(folder: Path) -> None:
-    folder.mkdir()
     rec.write_video(folder / "ada.mp4", FRAMES, (32, 32))
     camera = {"camera_f": np.array([50.0, 50]), "camera_c": np.array([15.5, 15.5]), "camera_k": np.zeros(5)}
     camera |= {"camera_t": np.zeros(3), "camera_rt": np.zeros(3), "width": 32, "height": 32}
@@ -179,24 +176,20 @@ def _read_uncalibrated(folder: Path, out: Path) -> object:
 
 
 def _motion(folder: Path) -> None:
-    folder.mkdir()
     np.savez_compressed(folder / "a.npz", poses=np.ones((3, 156)), trans=np.zeros((3, 3)), mocap_framerate=120.0)
 
 
 def _bvh(folder: Path) -> None:
-    folder.mkdir()
     offsets, turns = np.eye(3)[:2], np.tile(np.eye(3), (2, 2, 1, 1))
     write_bvh(folder / "a.bvh", Bvh(("arm", "fore"), np.array([-1, 0]), offsets, 0.04, turns[..., 0], turns))
 
 
 def _camera_path(folder: Path) -> None:
-    folder.mkdir()
     camera = {"K": rec.K, "R": np.eye(3).tolist(), "t_m": [0, 0, 3], "size_px": [24, 16]}
     (folder / "path.json").write_text(json.dumps([camera, camera]))
 
 
 def _preset(folder: Path) -> None:
-    folder.mkdir()
     text = "based_on: fast\ntraining:\n  steps: 100\n  field: {samples: 16}\ncapture:\n  max_frames: 10\n"
     (folder / "mine.yaml").write_text(text)
 
@@ -280,6 +273,7 @@ class Workshop:
         resource.setrlimit(resource.RLIMIT_AS, (mapped + ROOM_BYTES,) * 2)  # a MemoryError, not a machine that swaps
         logging.disable(logging.CRITICAL)
         for reader in READERS:
+            (root / reader.name).mkdir()
             reader.write(root / reader.name)
         self.files = {r.name: sorted(p for p in (root / r.name).rglob("*") if p.is_file()) for r in READERS}
         for reader in READERS:  # sound, they are read
