@@ -1,5 +1,6 @@
 """Cameras fitted to the exact outlines of a box in several places."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ def places(range_m: float = 0.1) -> list[np.ndarray]:
     return [CORNERS_M @ turn.T + [range_m * np.sin(i), range_m * np.cos(2 * i), 0] for i, turn in enumerate(turns)]
 
 
+@cache
 def outlines(range_m: float = 0.1) -> Outlines:
     seen_m = places(range_m)
     by_camera = {c.name: [MaskOutline.around(mask(c, corners_m)) for corners_m in seen_m] for c in ring(4)}

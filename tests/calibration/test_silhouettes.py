@@ -131,24 +131,29 @@ def test_rays_that_come_out_of_the_hull_count() -> None:
     assert found_px[before_px == 0].max() > 0.2
 
 
-def test_a_rendered_capture_tells_a_turned_camera(wave: Capture) -> None:
-    seen = Outlines.of(wave)
-    assert seen is not None
+@pytest.fixture(scope="module")
+def of_wave(wave: Capture) -> Outlines:
+    found = Outlines.of(wave)
+    assert found is not None
+    return found
+
+
+def test_a_rendered_capture_tells_a_turned_camera(wave: Capture, of_wave: Outlines) -> None:
     cameras = [wave.cameras[name] for name in wave.train_cameras]
-    assert seen.cost_px(cameras) < 0.05
+    assert of_wave.cost_px(cameras) < 0.05
     for i, camera in enumerate(cameras):
         off = turned(camera, 1.0, axis=i % 2)
-        assert seen.cost_px([off if j == i else other for j, other in enumerate(cameras)]) > 0.1
+        assert of_wave.cost_px([off if j == i else other for j, other in enumerate(cameras)]) > 0.1
 
 
-def test_wrong_cameras_do_not_change_the_masks(wave: Capture) -> None:
+def test_wrong_cameras_do_not_change_the_masks(wave: Capture, of_wave: Outlines) -> None:
     inverted = {
         name: dataclasses.replace(c, R=c.R.T, t_m=-c.R.T @ c.t_m) for name, c in wave.cameras.items()
     }  # fmt: skip
-    a, b = (Outlines.of(capture) for capture in (wave, wave.with_cameras(inverted)))
-    assert a is not None and b is not None
+    found = Outlines.of(wave.with_cameras(inverted))
+    assert found is not None
     for name in wave.train_cameras:
-        for one, other in zip(a.by_camera[name], b.by_camera[name], strict=True):
+        for one, other in zip(of_wave.by_camera[name], found.by_camera[name], strict=True):
             assert one is not None and other is not None
             np.testing.assert_allclose(one.distance_px, other.distance_px, atol=1e-4)  # OpenCV's last bits vary
 
