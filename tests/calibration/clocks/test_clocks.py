@@ -87,7 +87,8 @@ def test_a_drift_that_two_cameras_show_outlasts_a_third_that_tells_none(monkeypa
 
 
 def test_a_drift_of_200_ppm_in_five_minutes() -> None:
-    found = pair_clock(smoothed(filmed(0, 300, 0.0)), smoothed(filmed(1, 300, 12.34, 2e-4)))
+    tracks = filmed(0, 300, 0.0, fps=10), filmed(1, 300, 12.34, 2e-4, fps=10)
+    found = pair_clock(*(smoothed(Track(times_s, keypoints[:, ::4])) for times_s, keypoints in tracks))
     assert 1e6 * (found.rate - 1) == pytest.approx(200, abs=10)
     assert found.offset_s == pytest.approx(12.34, abs=0.1 / FPS)
 
