@@ -7,7 +7,9 @@ from hnerf.calibration.silhouettes import Outlines
 
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Disable evidence from images, for synthetic captures that have none: keypoints are the only evidence."""
+    """Disable evidence from images, for synthetic captures that have none: keypoints are the only evidence. Nothing is
+    drawn."""
     monkeypatch.setattr(Outlines, "of", lambda capture: None)
     monkeypatch.setattr(Matches, "of", lambda capture: Matches({}, 0))
-    monkeypatch.setattr(report, "draw_evidence", lambda *arguments: None)
+    for draw in ("draw_cameras", "draw_evidence"):
+        monkeypatch.setattr(report, draw, lambda *arguments: None)

@@ -23,6 +23,8 @@ from tests.calibration.synthetic import turned
 
 def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hnerf.calibration.refine.FRAMES", 4)
+    monkeypatch.setattr("hnerf.calibration.outline_adjustment.EVALUATIONS", 6)
+    monkeypatch.setattr("hnerf.calibration.silhouettes.POINTS", 32)
     off = wave.with_cameras(wave.cameras | {"02": turned(wave.cameras["02"], 2.0)})
     report = check_calibration(off, CalibrationSettings())
     report.save(tmp_path)
@@ -36,6 +38,7 @@ def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path, monkeyp
     assert used["matches"]["02"] == {"count": 0, "reason": "no overlap: no matches"}
     sheet = cv2.imread(str(tmp_path / "witnesses.png"))
     assert sheet is not None and sheet.shape[0] > 1000
+    assert cv2.imread(str(tmp_path / "cameras.png")) is not None
     assert load_cameras(tmp_path, off).train_cameras == wave.train_cameras
 
 

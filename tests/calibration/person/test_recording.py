@@ -1,6 +1,7 @@
 """From a folder of pictures and keypoint files to calibration files and clocks, by the commands."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 from flows.cli import main
 from hnerf.calibration.bundle import align
 from hnerf.calibration.clocks.recording import _track
+from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.clocks import read_clocks
 from hnerf.capture.formats.easymocap import EasyMocap, write_easymocap
 from hnerf.capture.formats.pose2sim import Pose2Sim
@@ -38,12 +40,19 @@ def write_recording(
     return folder
 
 
+def in_this_process(read: Callable[..., None], *arguments: object, folder: Path) -> None:
+    """Read as `run_caged` does, not in a process of its own."""
+    read(*arguments)
+
+
 @pytest.mark.parametrize("pose2sim", [False, True])
 def test_a_folder_gets_its_cameras(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, pose2sim: bool
 ) -> None:
-    monkeypatch.setattr("hnerf.calibration.person.calibrate.FRAMES", 2)  # here, not in a process of its own
-    monkeypatch.setattr("tasks.cage.run_caged", lambda read, *arguments, folder: read(*arguments))
+    monkeypatch.setattr("tasks.cage.run_caged", in_this_process)
+    monkeypatch.setattr("hnerf.calibration.person.calibrate.FRAMES", 2)
+    if pose2sim:  # the other folder's outlines are looked for
+        monkeypatch.setattr(Outlines, "of", lambda *_: None)
     truth = ring(3)
     seen = {name: found[:, 0] for name, found in detections(truth, 1.0).items()}
     folder, out = write_recording(tmp_path / "film", seen, pose2sim), tmp_path / "cameras"
@@ -87,7 +96,10 @@ def test_tracks_are_undistorted_once_by_a_lens_that_is_known(tmp_path: Path) -> 
         write_easymocap(folder, [lens])
 
 
-def test_a_folder_without_recordings_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_recordings_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tasks.cage.run_caged", in_this_process)
     for command in (["calibrate", str(tmp_path), "--from", "person", "--out", str(tmp_path / "x")],
                     ["synchronise", str(tmp_path)]):  # fmt: skip
         assert main(command) == 2
