@@ -116,6 +116,7 @@ def test_an_unknown_focal_length_returns(monkeypatch: pytest.MonkeyPatch) -> Non
     """A box that moves by a metre; three cameras a tenth too long, each that much too far away. The fourth's is
     known."""
     monkeypatch.setattr(silhouettes, "POINTS", 48)
+    monkeypatch.setattr(outline_adjustment, "EVALUATIONS", 8)
     given = [camera if camera.name == "c3" else _zoomed_about(camera, 1.1, MIDDLE_M) for camera in ring(4)]
     names = [camera.name for camera in given]
     found = adjust_to_outlines(outlines(0.5), given, names, MIDDLE_M, names[:3])
