@@ -21,12 +21,18 @@ def random_pose(rig: Rig, frames: int) -> Pose:
 
 def numeric_jacobian(pose: Pose, points: torch.Tensor) -> torch.Tensor:
     """Return the derivative (n, P, 3, U) of vertices by central differences through the plain rig."""
-    articulation, columns = Articulation(pose.rig), []
+    rig, articulation, columns = pose.rig, Articulation(pose.rig), []
+    few = dataclasses.replace(
+        rig,
+        vertices_m=rig.vertices_m[points],
+        skin_joints=rig.skin_joints[points],
+        skin_weights=rig.skin_weights[points],
+    )
     for u in range(articulation.unknowns):
         step = torch.zeros(len(pose.theta), articulation.unknowns, dtype=torch.float64)
         step[:, u] = 1e-5
         ends = [articulation.apply_step(pose, sign * step) for sign in (1, -1)]
-        above, below = (pose_vertices(end.rig, end.theta, end.root)[:, points] for end in ends)
+        above, below = (pose_vertices(few, end.theta, end.root) for end in ends)
         columns.append((above - below) / 2e-5)
     return torch.stack(columns, -1)
 
