@@ -1,4 +1,5 @@
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,10 +7,11 @@ import pytest
 from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import correctives_of
 from hnerf.asset.light import Light
+from hnerf.asset.package import write_package, write_usdz
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.staging import StagedAvatar, stage_avatar
 from hnerf.asset.texture import unwrap
-from tests.asset.figure import bending_body, posed_with_displacements, upright_column
+from tests.asset.figure import INFO, bending_body, posed_with_displacements, side_camera, upright_column, write_all
 
 
 @pytest.fixture(scope="session")
@@ -62,3 +64,20 @@ def captured(staged: StagedAvatar) -> StagedAvatar:
         normal_map=255 - staged.normal_map,
         albedo=Albedo(255 - staged.albedo.texture, Light(np.array([0.7, 0, 0.1, 0, 0, 0, 0, 0, 0]), 9.0)),
     )
+
+
+@pytest.fixture(scope="session")
+def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the files of `write_all`, for tests that change none."""
+    out = tmp_path_factory.mktemp("package")
+    write_all(out, staged)
+    return out
+
+
+@pytest.fixture(scope="session")
+def both(staged: StagedAvatar, captured: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the package and `avatar.usdz` of two topologies, for tests that change neither."""
+    out = tmp_path_factory.mktemp("both")
+    write_package(out, {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
+    write_usdz(out / "avatar.usdz", {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
+    return out

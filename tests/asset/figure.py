@@ -8,6 +8,8 @@ import numpy as np
 import torch
 import trimesh
 
+from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
+from hnerf.asset.staging import StagedAvatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
 from hnerf.capture.capture import Capture
@@ -15,6 +17,7 @@ from hnerf.geometry.camera import Camera
 from tests.body.boxes import hinged
 
 FRAMES = (3, 4, 5, 8)  # with a gap
+INFO = AssetInfo("column", "7", "CC0-1.0", "0123abcd")
 
 
 def column_rig() -> Rig:
@@ -77,3 +80,11 @@ def capture() -> Capture:
     """Return a capture of one camera, three training frames and one novel pose, without pixels."""
     cameras = {"01": side_camera()}
     return Capture("column", Path(), cameras, ("01",), (), FRAMES[:3], FRAMES[3:], 10.0, "z", {}, {})
+
+
+def write_all(out: Path, staged: StagedAvatar) -> None:
+    """Write the package, `avatar.usdz` and `avatar_cache.usdz`, of the column at 10 frames a second."""
+    cameras = [dataclasses.replace(side_camera(), name=name) for name in ("cam 1", "cam.1", "01")]
+    write_package(out, {"": staged}, cameras, 10.0, INFO)
+    write_usdz(out / "avatar.usdz", {"": staged}, cameras, 10.0, INFO)
+    write_cache(out / "avatar_cache.usdz", staged, cameras, 10.0, INFO)

@@ -11,7 +11,7 @@ from pxr import Ar, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.correctives import correctives_of
 from hnerf.asset.dome import dome
-from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
+from hnerf.asset.package import write_usdz
 from hnerf.asset.quads import polygon_corners
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import StagedAvatar, stage_avatar
@@ -19,9 +19,7 @@ from hnerf.asset.texture import unwrap
 from hnerf.asset.validation import each_variant
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
-from tests.asset.figure import FRAMES, bending_body, side_camera
-
-INFO = AssetInfo("column", "7", "CC0-1.0", "0123abcd")
+from tests.asset.figure import FRAMES, INFO, bending_body, write_all
 
 
 def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
@@ -45,14 +43,6 @@ def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
     return np.array(moved)
 
 
-def write_all(out: Path, staged: StagedAvatar) -> None:
-    """Write the package, `avatar.usdz` and `avatar_cache.usdz`, of the column at 10 frames a second."""
-    cameras = [dataclasses.replace(side_camera(), name=name) for name in ("cam 1", "cam.1", "01")]
-    write_package(out, {"": staged}, cameras, 10.0, INFO)
-    write_usdz(out / "avatar.usdz", {"": staged}, cameras, 10.0, INFO)
-    write_cache(out / "avatar_cache.usdz", staged, cameras, 10.0, INFO)
-
-
 def selected(stage: Usd.Stage, *sets: str) -> list[str]:
     """Return what is selected in variant sets."""
     return [stage.GetDefaultPrim().GetVariantSet(name).GetVariantSelection() for name in sets]
@@ -69,23 +59,6 @@ def expect_our_skin(stage: Usd.Stage, staged: StagedAvatar) -> list[np.ndarray]:
         points_m = skinned_points(stage, moving.codes[k] * 10 / moving.fps)
         np.testing.assert_allclose(points_m, expected[k][shown], atol=1e-5)
     return expected
-
-
-@pytest.fixture(scope="module")
-def both(staged: StagedAvatar, captured: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the package and `avatar.usdz` of two topologies."""
-    out = tmp_path_factory.mktemp("both")
-    write_package(out, {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
-    write_usdz(out / "avatar.usdz", {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
-    return out
-
-
-@pytest.fixture(scope="module")
-def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with these files."""
-    out = tmp_path_factory.mktemp("package")
-    write_all(out, staged)
-    return out
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
@@ -280,25 +253,21 @@ def test_further_motions_begin_with_the_captured_one_and_none_is_cut_off(tmp_pat
     np.testing.assert_allclose(motion.GetRotationsAttr().GetTimeSamples(), np.arange(3, 18.1, 0.5), atol=1e-9)
 
 
-def test_packaging_finds_every_file_and_is_silent(
-    staged: StagedAvatar, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+def test_the_same_avatar_is_silently_packed_to_the_same_bytes_at_any_time(
+    package: Path, staged: StagedAvatar, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    write_all(tmp_path, staged)
-    assert capfd.readouterr() == ("", "")
-    with ZipFile(tmp_path / "avatar.usdz") as archive:
-        assert set(archive.namelist()) == {"avatar.usdc", "texture.png", "albedo.png", "light.png", "normal_map.png"}
-
-
-def test_the_same_avatar_is_the_same_bytes_at_any_time(package: Path, staged: StagedAvatar, tmp_path: Path) -> None:
     """ZIP counts in steps of two seconds."""
     time.sleep(max(0.0, (package / "avatar_cache.usdz").stat().st_mtime + 2.0 - time.time()))
+    capfd.readouterr()
     write_all(tmp_path, staged)
+    assert capfd.readouterr() == ("", "")
     written = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
     # Interfaces, pictures, shapes, levels of detail, cameras, looks, rigs, motions, .usdz.
     assert len(written) == 3 + 4 + 2 + 2 + 1 + 2 + 2 + 3 + 2
     for path in written:
         assert path.read_bytes() == (package / path.relative_to(tmp_path)).read_bytes(), path.name
     with ZipFile(tmp_path / "avatar.usdz") as archive:
+        assert set(archive.namelist()) == {"avatar.usdc", "texture.png", "albedo.png", "light.png", "normal_map.png"}
         assert archive.testzip() is None
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
