@@ -29,9 +29,9 @@ def column_rig() -> Rig:
     return hinged(vertices_m, faces, joints_m, ("root", "upper.L"), upper_weight(vertices_m[:, 2]))
 
 
-def upright_column(radius_m: float, bottom_m: float, top_m: float) -> trimesh.Trimesh:
-    """Return a closed column around the z axis, in sixteen storeys of 24 sides."""
-    rings = [[radius_m, z] for z in np.linspace(bottom_m, top_m, 17)]
+def upright_column(radius_m: float, bottom_m: float, top_m: float, storeys: int = 16) -> trimesh.Trimesh:
+    """Return a closed column around the z axis, in storeys of 24 sides."""
+    rings = [[radius_m, z] for z in np.linspace(bottom_m, top_m, storeys + 1)]
     return trimesh.creation.revolve([[0, bottom_m], *rings, [0, top_m]], sections=24)
 
 

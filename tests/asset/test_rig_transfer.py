@@ -1,15 +1,14 @@
 import dataclasses
 
 import torch
-import trimesh
 
 from hnerf.asset.rig_transfer import strongest, transfer_skin_weights, with_vertices
-from tests.asset.figure import column_rig, upper_weight
+from tests.asset.figure import column_rig, upper_weight, upright_column
 
 
 def test_weights_follow_the_closest_point_of_the_body() -> None:
     rig = column_rig()
-    sleeve = trimesh.creation.cylinder(0.18, segment=[[0, 0, 0.1], [0, 0, 1.5]], sections=48).subdivide_to_size(0.04)
+    sleeve = upright_column(0.18, 0.1, 1.5, storeys=36)
     vertices_m, faces = torch.from_numpy(sleeve.vertices).float(), torch.from_numpy(sleeve.faces).long()
     joints, weights = transfer_skin_weights(rig, vertices_m, faces)
     upper = torch.where(joints == 1, weights, 0.0).sum(1)
