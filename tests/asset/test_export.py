@@ -26,6 +26,14 @@ SMALL = AssetSettings(
 )
 
 
+@pytest.fixture
+def small_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have few and small pictures in reports, and no viewer, for which the capture has no pixels."""
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
+    monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
+    monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))
+
+
 def test_surface_is_the_grown_body() -> None:
     body = bending_body()
     surface = surface_in_pose(StandInAvatar(body), torch.zeros_like(body.theta[0]), torch.eye(4), SMALL.grid_cells)
@@ -70,9 +78,8 @@ FILES |= {"avatar/shape_captured.usdc"}
 FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
 
 
+@pytest.mark.usefixtures("small_report")
 def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))  # the capture has no pixels for a viewer
-    monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
     frown_m = np.full((len(column_rig().vertices_m), 3), 0.01, np.float32)
     stout_m = frown_m * np.float32([1, 1, 0])  # its soles stay on the ground
     frowning = dataclasses.replace(
@@ -114,9 +121,8 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert stage.GetDefaultPrim().GetAssetInfoByKey("captureDigest") == "0123"
 
 
-def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
-    monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
+@pytest.mark.usefixtures("small_report")
+def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path) -> None:
     for topology, splats in (("registered", 0), ("both", 300)):
         (tmp_path / topology).mkdir()
         settings = overridden(SMALL, [f"topology={topology}", f"splats={splats}"])

@@ -136,19 +136,9 @@ def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path
 
 
 def test_interpolation_and_another_motion(subject: Path, tmp_path: Path) -> None:
-    options = [
-        "--between",
-        "0",
-        "2",
-        "--pictures",
-        "5",
-        "--motion",
-        str(subject),
-        "--path",
-        str(subject / "calibration"),
-    ]
+    options = ["--between", "0", "2", "--pictures", "3", "--motion", str(subject), "--path", f"{subject}/calibration"]
     assert main(["render", str(subject), "--out", str(tmp_path / "out"), "--what", "depth", *options]) == 0
-    assert len(numbers(tmp_path / "out", "depth")) == 5
+    assert len(numbers(tmp_path / "out", "depth")) == 3
 
 
 def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Path) -> None:
@@ -234,9 +224,14 @@ def test_a_copy_with_a_file_that_is_cut_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def _set(file: str, **changes: object) -> Callable[[Path], object]:
-    """Return what replaces keys of a subject's JSON file."""
-    return lambda subject: (subject / file).write_text(json.dumps(json.loads((subject / file).read_text()) | changes))
+def _set(**changes: object) -> Callable[[Path], object]:
+    """Return what replaces keys of a subject's capture."""
+
+    def change(subject: Path) -> None:
+        path = subject / "capture/capture.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+    return change
 
 
 def _set_camera(**changes: object) -> Callable[[Path], object]:
@@ -244,7 +239,7 @@ def _set_camera(**changes: object) -> Callable[[Path], object]:
 
     def change(subject: Path) -> None:
         cameras = json.loads((subject / "capture/capture.json").read_text())["cameras"]
-        _set("capture/capture.json", cameras=cameras | {"2": cameras["2"] | changes})(subject)
+        _set(cameras=cameras | {"2": cameras["2"] | changes})(subject)
 
     return change
 
@@ -261,13 +256,13 @@ def _replace(file: str, old: str, new: str) -> Callable[[Path], object]:
 
 
 NONSENSE = {
-    "no training cameras": (_set("capture/capture.json", train_cameras=[]), "capture.json: damaged"),
-    "an unknown training camera": (_set("capture/capture.json", train_cameras=["zz"]), "capture.json: damaged"),
-    "no cameras": (_set("capture/capture.json", cameras={}), "capture.json: damaged"),
-    "another axis": (_set("capture/capture.json", up="w"), "(up: w)"),
-    "a number for an axis": (_set("capture/capture.json", up=3), "(up: 3)"),
-    "a word for a frame rate": (_set("capture/capture.json", fps="x"), "capture.json: damaged"),
-    "no frame rate": (_set("capture/capture.json", fps=0), "(fps: 0)"),
+    "no training cameras": (_set(train_cameras=[]), "capture.json: damaged"),
+    "an unknown training camera": (_set(train_cameras=["zz"]), "capture.json: damaged"),
+    "no cameras": (_set(cameras={}), "capture.json: damaged"),
+    "another axis": (_set(up="w"), "(up: w)"),
+    "a number for an axis": (_set(up=3), "(up: 3)"),
+    "a word for a frame rate": (_set(fps="x"), "capture.json: damaged"),
+    "no frame rate": (_set(fps=0), "(fps: 0)"),
     "words for a size": (_set_camera(size_px=["a", "b"]), "capture.json: damaged"),
     "an endless size": (_set_camera(size_px=[10**9, 10**9]), "capture.json: declares"),
     "a camera nowhere": (_set_camera(t_m=[float("nan")] * 3), "capture.json: camera 2: T holds a NaN"),
