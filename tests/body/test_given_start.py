@@ -72,7 +72,7 @@ def test_contours_correct_given_poses_where_there_are_no_keypoints(model_file: P
     wrong.theta[:, 16, 2] += 0.15
     wrong.theta[:, 17, 2] -= 0.15
     capture, truth = recorded(model_file, tmp_path, wrong)
-    settings = FitSettings(body_model=model_file)
+    settings = FitSettings(body_model=model_file, contour_steps=4)
     begin = initial_pose_from_given(wrong, body_model(settings))
     fit, report = fit_body(capture, silhouettes(capture, truth), settings)
     before, after = ((joints_m(body) - joints_m(truth))[:, truth.rig.free].norm(dim=-1) for body in (begin, fit))
@@ -116,7 +116,10 @@ def test_anny_takes_the_pose_by_corresponding_joints(model_file: Path) -> None:
     assert float((hips[0] - hips[1]).norm(dim=-1).max()) < 0.08
 
 
-def test_anny_is_fitted_to_outlines_from_given_poses_alone(model_file: Path, tmp_path: Path) -> None:
+def test_anny_is_fitted_to_outlines_from_given_poses_alone(
+    model_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hnerf.body.fit.KEYPOINT_STEPS", 8)
     capture, truth = recorded(model_file, tmp_path, parameters())
     fit, report = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=2))
     wrists = [joints_m(body)[:, body.rig.joint_names.index("wrist.L")] for body in (fit, truth)]
