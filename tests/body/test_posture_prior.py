@@ -201,8 +201,8 @@ def test_one_posture_is_told_from_all_sides_only() -> None:
 
 
 def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: Path) -> None:
-    """Seen in one posture from eight sides, arms sway at most half as much, and the lean is at most 0.7 of that without
-    the priors."""
+    """Seen in one posture from eight sides, arms sway at most half as much, and the lean is at most 0.45 of that
+    without the priors; with the one on postures alone, it is 0.55."""
     problem, begin = turning_person(tmp_path, 0.0)
     arms = [begin.rig.joint_names.index(bone) for bone in ARMS]
 
@@ -222,4 +222,4 @@ def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: 
     posture_prior = PosturePrior.of_single_view([list(range(8))], begin, problem.observations.cameras[0])
     lean_m, sway = lean_and_sway(None, None)
     mended_lean_m, mended_sway = lean_and_sway(Balance(up=2), posture_prior)
-    assert mended_lean_m < 0.7 * lean_m and mended_sway < 0.5 * sway
+    assert mended_lean_m < 0.45 * lean_m and mended_sway < 0.5 * sway
