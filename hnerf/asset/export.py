@@ -23,12 +23,9 @@ from hnerf.asset.extreme_poses import extreme_poses
 from hnerf.asset.figures import (
     beyond_skinning_mm,
     level_figures,
-    light_figures,
     mesh_figures,
-    motion_figures,
     rig_figures,
     splat_figures,
-    surface_figures,
 )
 from hnerf.asset.glb import write_glb
 from hnerf.asset.normal_map import normal_map
@@ -39,7 +36,7 @@ from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.splat_ply import write_splat_ply
 from hnerf.asset.splats import Splats, surface_splats
 from hnerf.asset.staging import StagedAvatar, stage_avatar
-from hnerf.asset.topologies import AssetMesh, asset_meshes
+from hnerf.asset.topologies import AssetMesh, captured_mesh, registered_mesh
 from hnerf.asset.validation import validate_package
 from hnerf.asset.viewer import write_viewer
 from hnerf.avatar.avatar import Avatar
@@ -153,7 +150,8 @@ def _rest_meshes(avatar: Avatar, settings: AssetSettings, seconds: dict[str, flo
         rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
         dense = surface_in_pose(timeless, *rest, settings.grid_cells)
     with _timed("mesh", seconds):
-        meshes = asset_meshes(timeless.body.rig.to("cpu"), dense, settings.faces)
+        rig = timeless.body.rig.to("cpu")
+        meshes = {"registered": registered_mesh(rig, dense), "captured": captured_mesh(rig, dense, settings.faces)}
     with _timed("distances", seconds):
         return RestMeshes(dense, meshes, surface_distances_mm(dense, meshes))
 
@@ -226,21 +224,22 @@ def _figures(
     capture: Capture, meshes: RestMeshes, asset: MeshAsset, topology: str, settings: AssetSettings
 ) -> dict[str, Any]:
     """Return the figures of the surface, the rigs and the motions."""
-    surface, staged = asset.surface, asset.staged
+    surface, staged, dense = asset.surface, asset.staged, meshes.dense
+    light, motions = staged.albedo and staged.albedo.light, staged.rigs[FULL].motions
     return {
-        "surface": surface_figures(meshes.dense),
+        "surface": {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume},
         "mesh": mesh_figures(topology, surface.mesh, staged),
         "to_surface_mm": meshes.distances_mm,
         "findings": findings(meshes.distances_mm[topology]) if topology == "registered" else [],
         "levels": level_figures(staged),
         "texture_px": settings.texture_px,
         "normal_map_px": settings.normal_map_px,
-        "light": light_figures(staged.albedo.light) if staged.albedo else None,
+        "light": light and {"coefficients": light.coefficients.round(4).tolist(), "normals_turned_deg": light.turn_deg},
         "expressions": list(staged.expressions_m),
         "physiques": list(staged.physiques_m),
         "joints": len(staged.rigs[FULL].skeleton.names),
         "rigs": {name: rig_figures(staged, name) for name in staged.rigs},
-        "motions": motion_figures(staged),
+        "motions": {name: {"fps": motion.fps, "poses": len(motion.codes)} for name, motion in motions.items()},
         "frames": len(capture.frames),
         "beyond_skinning_mm": beyond_skinning_mm(surface.displacements_m, surface.correctives),
         "cameras": len(capture.cameras),

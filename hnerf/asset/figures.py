@@ -6,7 +6,6 @@ import numpy as np
 import trimesh
 
 from hnerf.asset.correctives import Correctives
-from hnerf.asset.light import Light
 from hnerf.asset.registration import crossing_faces
 from hnerf.asset.rigs import FULL, GAME, posed_frames
 from hnerf.asset.skinning import skinned
@@ -16,11 +15,6 @@ from hnerf.asset.topologies import AssetMesh
 from hnerf.geometry.mesh_queries import Surface
 
 SAMPLES = 20_000  # of a level of detail
-
-
-def surface_figures(dense: trimesh.Trimesh) -> dict[str, Any]:
-    """Return the size of the field's surface."""
-    return {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume}
 
 
 def mesh_figures(topology: str, mesh: AssetMesh, staged: StagedAvatar) -> dict[str, Any]:
@@ -86,16 +80,6 @@ def splat_figures(staged: StagedAvatar, splats: Splats) -> dict[str, float]:
         "moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)),
         "moved_max_mm": float(1e3 * worst_m.max()),
     }
-
-
-def motion_figures(staged: StagedAvatar) -> dict[str, dict[str, float]]:
-    """Return the rate and the number of poses of each motion."""
-    return {name: {"fps": motion.fps, "poses": len(motion.codes)} for name, motion in staged.rigs[FULL].motions.items()}
-
-
-def light_figures(light: Light) -> dict[str, Any]:
-    """Return the light's coefficients in the stage, and how far the normals of points turned to show it."""
-    return {"coefficients": light.coefficients.round(4).tolist(), "normals_turned_deg": light.turn_deg}
 
 
 def beyond_skinning_mm(displacements_m: np.ndarray, correctives: Correctives) -> dict[str, float]:

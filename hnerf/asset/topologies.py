@@ -71,15 +71,9 @@ class AssetMesh:
         return UvLayout(self.base.uvs, self.base.face_uvs)
 
 
-def asset_meshes(rig: Rig, dense: trimesh.Trimesh, faces: int) -> dict[str, AssetMesh]:
-    """Return the meshes by the names of `asset.topology`. rig: the body's; dense: the field's surface in the rest pose;
-    faces: at most that many triangles of the captured mesh."""
-    return {"registered": registered_mesh(rig, dense), "captured": captured_mesh(rig, dense, faces)}
-
-
 def registered_mesh(rig: Rig, dense: trimesh.Trimesh) -> AssetMesh:
-    """Return the body model's mesh moved onto the surface, with the body model's strongest joint weights. Joints stay
-    where they are, but for those of eyes."""
+    """Return the body model's mesh moved onto the field's surface in the rest pose, with the body model's strongest
+    joint weights. Joints stay where they are, but for those of eyes."""
     base = base_mesh(rig)
     found = register(base, dense)
     moved = with_vertices(base.rig, torch.from_numpy(found.vertices_m).float())
@@ -88,6 +82,6 @@ def registered_mesh(rig: Rig, dense: trimesh.Trimesh) -> AssetMesh:
 
 
 def captured_mesh(rig: Rig, dense: trimesh.Trimesh, faces: int) -> AssetMesh:
-    """Return the surface decimated to triangles, with joint weights from the body beneath."""
+    """Return that surface decimated to at most so many triangles, with joint weights from the body beneath."""
     surface = simplify(dense, faces)
     return AssetMesh(clothed_rig(rig, surface), as_they_are, len(surface.faces), None)
