@@ -340,3 +340,12 @@ def test_the_trimmed_cost_uses_every_view() -> None:
     assert trimmed_cost_px(cameras, keypoints) == pytest.approx(0, abs=1e-6)
     backwards = [turned(cameras[0], 180.0), *cameras[1:]]
     assert trimmed_cost_px(backwards, keypoints) > 400
+
+
+def test_no_camera_is_trimmed_away_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five cameras are 1 to 10 px off, 4.5 px in the mean of the lowest eight, and one is 100: (5 x 4.5 + 100) / 6. Of
+    all 60 errors, the lowest four fifths are without that camera's."""
+    cameras, off_px = ring(6), np.stack([*[np.arange(1.0, 11)] * 5, np.full(10, 100.0)])
+    keypoints = np.stack([found[:2, 0, :5].reshape(10, 3) for found in detections(cameras, 0).values()])
+    monkeypatch.setattr("hnerf.calibration.diagnosis.reprojection_px", lambda *_: off_px)
+    assert trimmed_cost_px(cameras, keypoints) == pytest.approx((5 * 4.5 + 100) / 6)

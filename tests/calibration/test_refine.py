@@ -116,7 +116,6 @@ def test_two_cameras_wrong_leave_the_others_alone(tmp_path: Path) -> None:
 
 
 def test_one_of_many_cannot_hide(tmp_path: Path) -> None:
-    # One of six sees a sixth of all keypoints: less than what is trimmed as detector errors.
     given = [turned(camera, 0.5) if camera.name == "c5" else camera for camera in ring(6)]
     keypoints = np.stack([seen[::2, 0] for seen in detections(ring(6), 2).values()])
     found = refined(tmp_path, given, keypoints)
