@@ -166,7 +166,7 @@ def test_there_is_no_network(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_stands_still_ends_with_its_stage(tmp_path: Path) -> None:
-    set_limits(LimitSettings(stage_s=2, image_s=0))
+    set_limits(LimitSettings(stage_s=6, image_s=0))
     with pytest.raises(StalledError), limited("capture", 1, resumable=False):
         run_caged(waits, tmp_path, folder=tmp_path)
     assert not Path("/proc", (tmp_path / "reader").read_text()).exists()
