@@ -111,9 +111,9 @@ def _refine_one_by_one(
             log.info("trying: %s", what)
             tried[name] = held_out_px[what] = held_out_cost_px(cameras, keypoints, (*changes, name), zoomed)
             kept[name] = f"pose kept: refining it takes held-out frames {_from_to(cost_px, tried[name])}"
-            if not matches.by_pair:  # nothing that could contradict
-                continue
-            if against := _contradiction(matches, cameras, adjust(cameras, keypoints, (*changes, name), zoomed)):
+            if matches.by_pair and (  # else nothing could contradict
+                against := _contradiction(matches, cameras, adjust(cameras, keypoints, (*changes, name), zoomed))
+            ):
                 kept[name] += f", but {against}"
                 del tried[name]
         name = min(tried, key=tried.__getitem__, default="")

@@ -9,7 +9,7 @@ from hnerf.calibration.silhouettes import Outlines
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Disable evidence from images, for synthetic captures that have none: keypoints are the only evidence. Nothing is
     drawn."""
-    monkeypatch.setattr(Outlines, "of", lambda capture: None)
-    monkeypatch.setattr(Matches, "of", lambda capture: Matches({}, 0))
+    monkeypatch.setattr(Outlines, "of", lambda *_: None)
+    monkeypatch.setattr(Matches, "of", lambda *_: Matches({}, 0))
     for draw in ("draw_cameras", "draw_evidence"):
-        monkeypatch.setattr(report, draw, lambda *arguments: None)
+        monkeypatch.setattr(report, draw, lambda *_: None)

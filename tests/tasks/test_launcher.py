@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from threading import Event, Thread
 
@@ -118,12 +119,13 @@ def test_a_report_that_had_no_room_is_a_full_disk(tmp_path: Path) -> None:
     assert is_retryable(found) and str(found) == f"[Errno 28] No space left on device: '{tmp_path}/{launcher.FAILURE}'"
 
 
-def test_ranks_end_with_a_caller_that_is_killed(tmp_path: Path) -> None:
-    """One that is interrupted ends them as one does whose time is over: tests/tasks/test_limits.py."""
+@pytest.mark.parametrize("fatal", [signal.SIGKILL, signal.SIGINT])
+def test_ranks_end_with_the_caller(tmp_path: Path, fatal: signal.Signals) -> None:
     code = f"from tasks.launcher import run_ranks; run_ranks({RANKS!r}, ['sleep', {str(tmp_path)!r}], 2)"
-    caller = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background job would ignore it
+    caller = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, preexec_fn=heard)
     wait_until_running(tmp_path, 2)
-    caller.kill()
+    os.kill(caller.pid, fatal)
     caller.wait()
     wait_until_running(tmp_path, 0)
 

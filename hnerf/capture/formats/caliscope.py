@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.formats.easymocap import EasyMocap
-from hnerf.capture.formats.pose2sim import lenses_from_tables
+from hnerf.capture.formats.pose2sim import camera_tables, lenses_from_tables
 from hnerf.capture.lens import Lens, known_size
 from hnerf.capture.safe_io import path_in_capture, read_toml
 from hnerf.errors import InputError
@@ -32,7 +32,7 @@ class Caliscope(EasyMocap):
         """Return every camera that the file calibrates and does not ignore."""
         caliscope = path_in_capture(self.folder, "camera_array.toml")
         path = caliscope if caliscope.exists() else path_in_capture(self.folder, "calibration.toml")
-        return lenses_from_tables(path, _caliscope_tables(path) if path == caliscope else read_toml(path))
+        return lenses_from_tables(path, _caliscope_tables(path) if path == caliscope else camera_tables(path))
 
 
 def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:

@@ -26,7 +26,7 @@ class Pose2Sim(Layout):
         files = [p for p in files_in(self.folder, "calibration") if p.match("Calib*.toml")]
         if len(files) != 1:
             raise InputError(f"{self.folder / 'calibration'}: {len(files)} files Calib*.toml; leave exactly one")
-        return lenses_from_tables(files[0], read_toml(files[0]))
+        return lenses_from_tables(files[0], camera_tables(files[0]))
 
     def footage(self, camera: str) -> Footage:
         """Return videos/<camera>.mp4."""
@@ -43,10 +43,15 @@ def _natural_order(path: Path) -> list[str | int]:
     return [int(part) if i % 2 else part for i, part in enumerate(re.split("([0-9]+)", path.stem))]
 
 
+def camera_tables(path: Path) -> dict[str, Any]:
+    """Return the tables of cameras in a file of Pose2Sim or aniposelib."""
+    return {key: table for key, table in read_toml(path).items() if key != "metadata"}
+
+
 def lenses_from_tables(source: Path, tables: dict[str, Any]) -> dict[str, Lens]:
-    """Return the lenses in a file's tables of cameras, by name; its table `metadata` is none. Raises InputError where
-    there are none, or as `lens_from_table` does."""
-    lenses = [lens_from_table(source, key, table) for key, table in tables.items() if key != "metadata"]
+    """Return the lenses in a file's tables of cameras, by name. Raises InputError where there are none, or as
+    `lens_from_table` does."""
+    lenses = [lens_from_table(source, key, table) for key, table in tables.items()]
     if not lenses:
         raise InputError(f"{source}: calibrates no camera; calibrate again")
     return by_name(lenses, source)

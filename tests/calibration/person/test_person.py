@@ -21,18 +21,14 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import STANDING_M, detections, look_at, ring, turned, walk_m, write_capture
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 STATURE_M = 1.56 / 0.87  # of the figure: its limb chain, over the chain's share of an adult's stature
 
 
 def lost(camera: Camera) -> Camera:
     """Return the camera without its pose."""
     return dataclasses.replace(camera, R=np.eye(3), t_m=np.zeros(3))
-
-
-@pytest.fixture(autouse=True)
-def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Find no outlines in captures without images."""
-    monkeypatch.setattr(Outlines, "of", lambda *_: None)
 
 
 def worst_errors(cameras: list[Camera], truth: list[Camera]) -> tuple[float, float]:
