@@ -13,7 +13,7 @@ from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 @dataclass(frozen=True)
 class BodyFit:
     """A fitted body: rig, linearised at the fitted shape (its `beta`); frames (n,); theta (n, J, 3) radians, zero at
-    locked joints and at the root joint; root (n, 4, 4) world from body, metres."""
+    the root joint and at locked joints other than fingers; root (n, 4, 4) world from body, metres."""
 
     rig: Rig
     frames: tuple[int, ...]

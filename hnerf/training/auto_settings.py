@@ -185,9 +185,9 @@ def _steps(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
 def _outline_distance_px(mask: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """Return the distances (P,) of a mask's outline from the body's silhouette, negative inside it."""
     outline = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
-    normal_displacement = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outwards = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     inwards = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return (normal_displacement - inwards)[outline]
+    return (outwards - inwards)[outline]
 
 
 def _thickness_m(reach_m: float) -> float:

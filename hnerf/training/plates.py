@@ -25,7 +25,7 @@ class Plate:
 
 def plates_of(capture: Capture, masks: Masks, frames: tuple[int, ...]) -> list[Plate] | None:
     """Return the plates of the training cameras, clean ones if there are, else as masks leave them free; None if a
-    camera's person hides the background behind most of the own outline in all frames."""
+    camera's person hides the background behind most of their own outline in all frames."""
     plates = []
     for name in capture.train_cameras:
         clean = capture.background(name)
