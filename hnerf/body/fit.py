@@ -114,7 +114,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         report = _report(capture, masks, observations, pose, fit, seconds)
         if single:
             report["on_ground"] = on_ground
-            _warn_of_stature(report["stature_m"], settings)
+            _warn_of_stature(report["stature_m"], settings, capture.stature_m is not None)
         if given_pose:
             report["given_poses"] = given_poses_note(model, capture)
         return fit, report
@@ -267,16 +267,18 @@ def _report(
     }
 
 
-def _warn_of_stature(stature_m: float, settings: FitSettings) -> None:
-    """Warn where a single camera makes the person taller or smaller than expected: then it may be that they do not
-    stand on height 0."""
+def _warn_of_stature(stature_m: float, settings: FitSettings, stated: bool) -> None:
+    """Warn where a single camera makes the person taller or smaller than expected, or than `capture.toml` states: then
+    it may be that they do not stand on height 0."""
     off_m = stature_m - settings.stature_m
     if abs(off_m) > MAX_STATURE_SIGMAS * settings.stature_std_m:
         log.warning(
-            "the person comes out %.2f m tall, %.2f m expected: do they stand on world height 0, and is the camera's "
-            "height right? State their height as stature_m in capture.toml",
+            "the person comes out %.2f m tall, %.2f m %s: do they stand on world height 0, and is the camera's height "
+            "right? %s",
             stature_m,
             settings.stature_m,
+            "stated" if stated else "expected",
+            "Check stature_m in capture.toml, too" if stated else "State their height as stature_m in capture.toml",
         )
 
 

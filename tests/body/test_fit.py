@@ -120,8 +120,20 @@ def test_a_stature_that_one_camera_tells_is_doubted_beyond_one_and_a_half_standa
     settings = FitSettings(stature_m=1.72, stature_std_m=0.08)
     for stature_m, words in ((1.83, ""), (1.61, ""), (1.85, "1.85 m tall, 1.72 m expected")):
         caplog.clear()
-        _warn_of_stature(stature_m, settings)
+        _warn_of_stature(stature_m, settings, stated=False)
         assert words in caplog.text and bool(words) == bool(caplog.text)
+
+
+@pytest.mark.usefixtures("few_steps")
+def test_who_stated_a_stature_is_not_asked_to_state_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hnerf.body.fit.MAX_STATURE_SIGMAS", 0)
+    for stature_m, advice in ((None, "State their height"), (1.7, "1.70 m stated: do they stand on world height 0")):
+        caplog.clear()
+        fit_body(replace(record(tmp_path, moving_body((0, 1)), RING, ("0",)), stature_m=stature_m), None, FitSettings())
+        assert [advice in text for text in caplog.messages if "m tall" in text] == [True]
+        assert ("State their height" in caplog.text) == (stature_m is None)
 
 
 @pytest.mark.usefixtures("few_steps")
