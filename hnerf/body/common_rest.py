@@ -17,11 +17,12 @@ def with_common_rest(
     rig: Rig, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]
 ) -> tuple[Rig, Tensor, Tensor]:
     """Return a rig whose rest pose includes the mean change of all poses, and the poses that then reproduce `after`;
-    with it, poses `before` show the body turned and moved by that mean change.
+    with it, poses `before` show the body turned and moved by that mean change, exactly if only one joint of a chain
+    turns: a change of a joint and turns of those below it do not commute.
 
-    before, after: theta (n, J, 3) and root (n, 4, 4). Joints, and points that are rigid on one, stay where they were;
-    points blended between joints differ by the square of the mean turn. The shape basis, which would turn likewise, is
-    kept.
+    before, after: theta (n, J, 3) and root (n, 4, 4). Joints, and points that are rigid on one, stay where they were in
+    `after`; points blended between joints differ by the square of the mean turn. The shape basis, which would turn
+    likewise, is kept.
     """
     theta, root = _mean_change(before, after)
     resting = joint_transforms(rig, theta, root)

@@ -1,5 +1,5 @@
-"""Fit of the fingers to hand points, with the body held: close to their medians over the frames, or relaxed where few
-frames show the hand."""
+"""Fit of the fingers to hand points, with the body held: close to their medians over the frames that show the hand; if
+there are few of these, the others show it relaxed."""
 
 import itertools
 import math
