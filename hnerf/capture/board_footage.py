@@ -275,8 +275,9 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
             found[name] = Video.open(path)
             continue
         files = safe_io.files_in(folder, "calibration", part, path.name, suffixes=safe_io.IMAGE_SUFFIXES)
-        if not files:
-            raise InputError(f"{path}: no JPEG or PNG images; add them or remove the folder")
+        if not files:  # such as the CHARUCO/ that Caliscope leaves here
+            log.warning("%s: no JPEG or PNG images, and not read", path)
+            continue
         found[name] = ImageFolder(path, safe_io.numbered(files, "images"))
     return found
 

@@ -160,6 +160,19 @@ def test_footage_with_a_suffix_in_upper_case_is_not_left_out(tmp_path: Path) -> 
     assert footage is not None and list(footage.corners_px) == ["cam_0", "cam_1"]
 
 
+def test_what_caliscope_leaves_beside_the_footage_is_no_camera(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    place = tmp_path / "calibration" / "extrinsic"
+    rec.write_video(place / "cam_0.mp4", 3)
+    (place / "CHARUCO").mkdir()
+    (place / "CHARUCO" / "image_points.csv").write_text("sync_index,cam_id\n")
+    footage = read_board_footage(tmp_path, "extrinsic")
+    assert footage is not None and list(footage.corners_px) == ["cam_0"]
+    assert "CHARUCO: no JPEG or PNG images, and not read" in caplog.text
+
+
 def test_videos_of_other_lengths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     for camera, count in {"cam_0": 3, "cam_1": 4}.items():
