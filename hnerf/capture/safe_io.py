@@ -40,6 +40,7 @@ _UPRIGHT = dict(enumerate(  # by EXIF orientation, 2 to 8: what turns the pictur
      Image.Transpose.TRANSPOSE, Image.Transpose.ROTATE_270, Image.Transpose.TRANSVERSE, Image.Transpose.ROTATE_90), 2
 ))  # fmt: skip
 _CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # is used as a folder name, and in a glob without wildcards
+_FRAME_NAME = re.compile(r"0*([0-9]{1,9})|(?:.*_)?0*([0-9]{1,9})_keypoints")
 _KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"{_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART}){{{MAX_KEY_PARTS}}}")
 _ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which is given keypoints with camera names as keywords
@@ -135,14 +136,14 @@ def by_camera(paths: list[Path]) -> dict[str, Path]:
 
 
 def numbered(paths: list[Path], what: str) -> dict[int, Path]:
-    """Return files by the frame number that their name starts with. Raises InputError on a name without a number, or if
-    two files have the same."""
+    """Return files by the frame number that is their name, or, as OpenPose names its files, that comes before
+    `_keypoints`. Raises InputError on another name, or if two files have the same number."""
     by_frame: dict[int, Path] = {}
     for path in paths:
-        found = re.fullmatch(r"([0-9]{1,9})(?:_keypoints)?", path.stem)
+        found = _FRAME_NAME.fullmatch(path.stem)
         if not found:
             raise InputError(f"{path}: {what} are named by frame, like 000000{path.suffix}; rename or remove it")
-        frame = int(found[1])
+        frame = int(found[1] or found[2])
         if frame in by_frame:
             raise InputError(f"{path}: frame {frame} is also {by_frame[frame].name}; keep one of them")
         by_frame[frame] = path

@@ -260,6 +260,14 @@ def test_suffixes_may_be_in_upper_case(tmp_path: Path) -> None:
         assert ingest(folder, SETTINGS, tmp_path / f"{write.__name__}-out").has_keypoints
 
 
+@pytest.mark.parametrize("prefix", ["", "clip_07_"])
+def test_keypoints_may_be_called_as_openpose_calls_them(folder: Path, tmp_path: Path, prefix: str) -> None:
+    plain = ingest(folder, SETTINGS, tmp_path / "plain").keypoints("01")
+    for path in folder.glob("openpose/*/*"):
+        path.rename(path.with_name(f"{prefix}{int(path.stem[:6]):012d}_keypoints.json"))
+    assert np.array_equal(ingest(folder, SETTINGS, tmp_path / "out").keypoints("01"), plain)
+
+
 def test_numbers_without_zeros_before_them_are_sorted_as_numbers(tmp_path: Path) -> None:
     folder = rec.write_pose2sim(tmp_path / "walker")
     for path in (folder / "pose" / "cam01_json").iterdir():
