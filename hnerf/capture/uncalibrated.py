@@ -78,7 +78,14 @@ class Uncalibrated(Layout):
 
     def footage(self, camera: str) -> Footage:
         """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""
-        return EasyMocap(self.folder).footage(camera)
+        if camera not in self._opened:
+            self._opened[camera] = EasyMocap(self.folder).footage(camera)
+        return self._opened[camera]
+
+    @cached_property
+    def _opened(self) -> dict[str, Footage]:
+        """Return the footage that was asked for so far: to open a video is to decode all of it."""
+        return {}
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return openpose/<camera>/, else pose/<camera>_json/."""

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from hnerf.capture.capture import SubjectPoint, write_image
+from hnerf.capture.footage import Video
 from hnerf.capture.ingest import ingest, recognise
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.capture.video_metadata import KEY, MAX_METADATA_BYTES, focal_35mm
@@ -91,6 +92,20 @@ def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> No
     capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder))
     assert capture.train_cameras == ("left", "right") and len(capture.frames) == 3
     assert capture.cameras["left"].K[0, 0] == pytest.approx(0.85 * 96)
+
+
+def test_each_video_is_decoded_once_to_count_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, opened, opening = tmp_path / "film", list[str](), Video.open
+    for name in ("left", "right"):
+        write_video(folder / f"{name}.mp4", 3)
+
+    def open_counted(path: Path) -> Video:
+        opened.append(path.name)
+        return opening(path)
+
+    monkeypatch.setattr(Video, "open", open_counted)
+    ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder))
+    assert sorted(opened) == ["left.mp4", "right.mp4"]
 
 
 def test_images_come_before_a_video_of_the_same_name(tmp_path: Path) -> None:

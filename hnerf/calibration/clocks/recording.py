@@ -10,7 +10,7 @@ from hnerf.calibration.clocks.estimate import Clocks, estimate_clocks
 from hnerf.calibration.clocks.keypoints import Track
 from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.capture.clocks import frame_times_s
-from hnerf.capture.footage import Footage, Video
+from hnerf.capture.footage import Video
 from hnerf.capture.ingest import DEFAULT_FPS, ingest, recognise
 from hnerf.capture.lens import Lens, undistort_keypoints
 from hnerf.capture.manifest import read_manifest
@@ -36,9 +36,10 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
     fps = read_manifest(folder).fps or DEFAULT_FPS
     lenses, tracks, sounds = _calibration(folder, names), dict[str, Track](), dict[str, np.ndarray]()
     for name in names:
-        footage = Uncalibrated(folder).footage(name)
+        alone = Uncalibrated(folder, only=name)
         with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
-            tracks[name] = _track(folder, name, footage, fps, lenses.get(name), Path(scratch))
+            tracks[name] = _track(alone, name, fps, lenses.get(name), Path(scratch))
+        footage = alone.footage(name)
         sound = read_sound(footage.path) if isinstance(footage, Video) else None
         if sound is not None:
             sounds[name] = sound
@@ -56,17 +57,17 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
         raise InputError(f"{folder}: {error}") from None
 
 
-def _track(folder: Path, name: str, footage: Footage, fps: float, lens: Lens | None, scratch: Path) -> Track:
+def _track(alone: Uncalibrated, name: str, fps: float, lens: Lens | None, scratch: Path) -> Track:
     """Return the subject's keypoints in all frames of one camera, in recorded pixels, undistorted if the lens is
     known."""
-    alone = Uncalibrated(folder, only=name)
     settings = CaptureSettings(max_frames=MAX_FRAMES)
-    capture = with_keypoints(ingest(folder, settings, scratch / "capture", alone), scratch / "detected")
+    capture = with_keypoints(ingest(alone.folder, settings, scratch / "capture", alone), scratch / "detected")
     keypoints = subject_keypoints(capture)[name]
     scale = np.array(capture.recorded_sizes_px[name]) / capture.cameras[name].size_px
     keypoints[..., :2] = keypoints[..., :2] * scale + (scale - 1) / 2
     if lens is not None and name not in capture.recorded_lenses:  # by which its images would be undistorted
         keypoints = undistort_keypoints(keypoints, lens.K, lens.distortion)
+    footage = alone.footage(name)
     rows = np.searchsorted(footage.frames, capture.frames)
     return Track(frame_times_s(footage, fps)[rows], keypoints)
 

@@ -78,7 +78,7 @@ def test_tracks_are_in_pixels_of_the_recording(tmp_path: Path) -> None:
     """Its pictures are shrunk to 1024 px."""
     seen = filmed(0, 0.1, 0.0).keypoints * [2.048, 2.048, 1]
     folder = write_recording(tmp_path / "film", {"c0": seen}, side_px=2048)
-    track = _track(folder, "c0", Uncalibrated(folder).footage("c0"), 30.0, None, tmp_path)
+    track = _track(Uncalibrated(folder, only="c0"), "c0", 30.0, None, tmp_path)
     np.testing.assert_allclose(track.keypoints, seen, atol=1e-3)
     np.testing.assert_allclose(track.times_s, [0, 1 / 30, 2 / 30])
 
@@ -91,7 +91,7 @@ def test_tracks_are_undistorted_once_by_a_lens_that_is_known(tmp_path: Path) -> 
     seen = np.broadcast_to([916.0, 500.0, 0.8], (3, 25, 3)) + 1e-3 * np.arange(25)[:, None] * [0, 1, 0]
     folder = write_recording(tmp_path / "film", {"c0": seen})
     for scratch in (tmp_path / "given", tmp_path / "read"):
-        track = _track(folder, "c0", Uncalibrated(folder).footage("c0"), 30.0, lens, scratch)
+        track = _track(Uncalibrated(folder, only="c0"), "c0", 30.0, lens, scratch)
         assert track.keypoints[0, 0].tolist() == pytest.approx([900, 500, 0.8], abs=0.05)
         write_easymocap(folder, [lens])
 
