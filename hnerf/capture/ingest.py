@@ -161,7 +161,13 @@ def recognise(folder: Path) -> Layout:
     for layout in LAYOUTS:
         if layout.recognises(folder):
             return layout(folder)
-    if cameras_without_calibration(folder):
+    cameras = cameras_without_calibration(folder)
+    if len(cameras) == 1:
+        raise InputError(
+            f"{folder / 'images' / cameras[0]}: one camera without a calibration is read from a video only; make a "
+            "video of its images, or add intri.yml and extri.yml"
+        )
+    if cameras:
         raise InputError(
             f"{folder}: no calibration of its cameras (extri.yml or another); "
             f"`hnerf calibrate {folder} --from person` finds them from the person, --from boards from a board"

@@ -126,6 +126,9 @@ def test_two_videos_of_one_name_are_refused_and_sound_is_none(tmp_path: Path, pl
 
 def test_a_run_names_the_command_that_calibrates(tmp_path: Path) -> None:
     write_images(tmp_path, "a")
+    with pytest.raises(InputError, match=r"images/a: one camera .* make a video"):  # which cannot be calibrated
+        recognise(tmp_path)
+    write_images(tmp_path, "b")
     with pytest.raises(InputError, match=r"no calibration.*hnerf calibrate .* --from person"):
         recognise(tmp_path)
 
