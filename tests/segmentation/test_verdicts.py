@@ -51,3 +51,15 @@ def test_jumps_need_both_neighbours_and_prior(stride: int) -> None:
     expected = [50, 50, 50, 50, 50, 50, 100, 50, 50, 50]
     found = area_jumps(frames, [MaskVerdict(None, None, area) for area in areas], expected)
     assert found == {2 * stride: "area jumps from 100 to 200 px"}
+
+
+def test_a_mask_is_compared_with_near_frames_alone() -> None:
+    looked_at = list[object]()
+
+    class Frames(tuple[int, ...]):
+        def __getitem__(self, number: object) -> int:
+            looked_at.append(number)
+            return super().__getitem__(number)
+
+    assert area_jumps(Frames(range(300)), [MaskVerdict(None, None, 1000)] * 300, [1000] * 300) == {}
+    assert len(looked_at) < 20 * 300  # not 300 * 300
