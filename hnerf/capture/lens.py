@@ -46,11 +46,16 @@ def undistort_points(points_px: np.ndarray, K: np.ndarray, distortion: np.ndarra
     if points_px.size == 0:  # for which OpenCV returns None
         return points_px
     flat = np.ascontiguousarray(points_px.reshape(-1, 1, 2))
-    straight = cv2.undistortPoints(flat, K, distortion, P=K, criteria=UNDISTORTED)
-    rays = cv2.convertPointsToHomogeneous(straight)[:, 0] @ np.linalg.inv(K).T
-    pictured = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, distortion)[0]
-    straight[~(np.linalg.norm(pictured - flat, axis=-1) < MAX_OFF_PX)] = np.nan
+    straight = cv2.undistortPoints(flat, K, distortion, P=K, criteria=UNDISTORTED)[:, 0]
+    pictured = distort_points(straight, K, distortion)
+    straight[~(np.linalg.norm(pictured - flat[:, 0], axis=-1) < MAX_OFF_PX)] = np.nan
     return straight.reshape(points_px.shape)
+
+
+def distort_points(points_px: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Map pixels (N, 2) of the pinhole camera with this K to those of the recorded image."""
+    rays = np.concatenate([points_px, np.ones((len(points_px), 1))], 1) @ np.linalg.inv(K).T
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
 
 
 def undistort_keypoints(keypoints: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:

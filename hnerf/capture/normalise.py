@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import read_rgb, write_image
-from hnerf.capture.lens import Lens, undistort_keypoints
+from hnerf.capture.lens import Lens, distort_points, undistort_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
@@ -105,8 +105,7 @@ def kept_share(lens: Lens, size_px: tuple[int, int]) -> float:
     samples."""
     corner = np.array(size_px) - 1.0
     at_px = np.stack(np.meshgrid(*np.linspace(0, corner, GRID).T), -1).reshape(-1, 2)
-    rays = np.concatenate([at_px, np.ones((len(at_px), 1))], 1) @ np.linalg.inv(lens.K).T
-    recorded_px = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
+    recorded_px = distort_points(at_px, lens.K, lens.distortion)
     return float(((recorded_px >= -0.5) & (recorded_px <= corner + 0.5)).all(1).mean())
 
 

@@ -4,6 +4,7 @@ names."""
 import numpy as np
 
 from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.lens import distort_points
 from hnerf.capture.people import PersonTrack, follow_in_each_camera, follow_people, moves
 from hnerf.errors import InputError
 from hnerf.geometry.camera import resampling
@@ -124,5 +125,7 @@ def _place(capture: Capture, *people: PersonTrack) -> str:
     for person in people:
         keypoints = person.keypoints[c, frame]
         x, y, _ = to_recorded @ [*np.median(keypoints[keypoints[:, 2] > 0, :2], axis=0), 1]
+        if lens := capture.recorded_lenses.get(camera.name):
+            ((x, y),) = distort_points(np.array([[x, y]]), *map(np.array, lens))
         places.append(f"({x:.0f}, {y:.0f})")
     return f"at {' and '.join(places)} in camera {camera.name}, frame {capture.frames[frame]}"

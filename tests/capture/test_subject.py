@@ -154,6 +154,10 @@ def test_two_who_have_the_same_claim_are_placed_in_recorded_pixels(tmp_path: Pat
     capture = dataclasses.replace(capture, recorded_sizes_px={"c0": (8000, 8000)})
     with pytest.raises(InputError, match=r"at \(4804, 4004\) and \(3204, 4004\) in camera c0, frame 0"):
         subject_keypoints(capture)
+    # Its lens draws them in, by 1 - r^2 with r = 0.1005 and 0.0995 focal lengths from the middle of the picture.
+    lens = [[8000.0, 0, 3999.5], [0, 8000, 3999.5], [0, 0, 1]], [-1.0, 0, 0, 0]
+    with pytest.raises(InputError, match=r"at \(4795, 4003\) and \(3211, 4003\) in camera c0, frame 0"):
+        subject_keypoints(dataclasses.replace(capture, recorded_lenses={"c0": lens}))
 
 
 @pytest.mark.parametrize("chosen", [0, 1])
