@@ -38,8 +38,9 @@ def cameras_without_calibration(folder: Path) -> list[str]:
     """Return the cameras whose images or videos lie in a folder without poses of cameras: the folders of images/, else
     the videos of videos/, else those of the folder itself; none where there are none."""
     images = path_in_capture(folder, "images")
-    if images.is_dir():
-        return [check_camera_name(path.name, path) for path in sorted(images.iterdir()) if path.is_dir()]
+    folders = [path for path in sorted(images.iterdir()) if path.is_dir()] if images.is_dir() else []
+    if folders:
+        return [check_camera_name(path.name, path) for path in folders]
     for place in (("videos",), ()):
         if videos := files_in(folder, *place, suffixes=VIDEO_SUFFIXES):
             return list(by_camera(videos))
