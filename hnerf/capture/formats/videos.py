@@ -45,9 +45,10 @@ class Videos(Layout):
         if not known.source:
             log.warning(
                 "%s: no calibration: a camera held level, whose longer side sees %.0f degrees, is assumed; if that is "
-                "wrong, limbs are too deep or too flat: state field_of_view_deg in capture.toml",
+                "wrong, limbs are too deep or too flat: state field_of_view_deg in capture.toml%s",
                 self.folder,
                 np.rad2deg(2 * np.arctan(0.5 / USUAL_FOCAL)),
+                "" if self.folder.is_dir() else ", in a folder with the video, and run that folder",
             )
         return {name: dataclasses.replace(known.lens, R=CAMERA_FROM_Z_UP)}
 

@@ -27,6 +27,7 @@ def test_one_file_is_a_capture(clip: Path, tmp_path: Path, caplog: pytest.LogCap
         ingest(clip, SETTINGS, tmp_path / "out")
     found = Capture.load(tmp_path / "out")
     assert "longer side sees 61 degrees, is assumed" in caplog.text
+    assert "in capture.toml, in a folder with the video" in caplog.text  # what lies beside a file is not read
     camera = found.cameras["my clip"]
     assert found.name == "my clip" and found.frames == (0, 1, 2, 3, 4, 5) and not found.has_keypoints
     np.testing.assert_allclose(camera.K, [[54.4, 0, 31.5], [0, 54.4, 23.5], [0, 0, 1]], atol=1e-3)
