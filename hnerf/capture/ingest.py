@@ -69,6 +69,7 @@ LAYOUTS: tuple[type[Layout], ...] = (
 BLACK = 8  # grey level that noise and an encoder leave of black
 MAX_NAMED = 5  # in a warning
 BY_CAMERA = ("images", "videos", "openpose", "masks", "mask", "background")  # folders of EasyMocap
+READ_SUFFIXES = VIDEO_SUFFIXES + IMAGE_SUFFIXES + JSON_SUFFIXES
 BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 
 log = logging.getLogger("hnerf.capture")
@@ -84,6 +85,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     """
     layout = uncalibrated or recognise(folder)
     lenses = layout.lenses()
+    if not uncalibrated:
+        _warn_of_unread(folder, ("keypoints",), set(lenses))
     if isinstance(layout, EasyMocap):
         _warn_of_unread(folder, BY_CAMERA, set(lenses))
     if isinstance(layout, Pose2Sim):
@@ -203,7 +206,7 @@ def _warn_of_unread(folder: Path, places: tuple[str, ...], expected: set[str]) -
         found = path_in_capture(folder, place)
         entries = [p for p in sorted(found.iterdir()) if not p.name.startswith(".")] if found.is_dir() else []
         named = [path.name for path in entries if path.is_dir()]
-        named += [path.stem for path in entries if path.suffix.lower() in VIDEO_SUFFIXES + IMAGE_SUFFIXES]
+        named += [path.stem for path in entries if path.suffix.lower() in READ_SUFFIXES]
         unread = [shown(name) for name in named if unicodedata.normalize("NFC", name) not in expected]
         if unread:
             some = ", ".join(unread[:MAX_NAMED]) + (", ..." if len(unread) > MAX_NAMED else "")

@@ -99,6 +99,19 @@ def test_what_is_of_no_calibrated_camera_is_told(
     ]
 
 
+def test_keypoints_of_no_calibrated_camera_are_told(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (folder / "keypoints").mkdir()
+    for camera in ("01", "cam02"):
+        (folder / "keypoints" / f"{camera}.json").write_text("[]")
+    with caplog.at_level(logging.WARNING, "hnerf.capture"):
+        ingest(folder, SETTINGS, tmp_path / "out")
+    assert caplog.messages == [
+        f"{folder}/keypoints: 'cam02' not in the calibration, and not read; rename or remove them"
+    ]
+
+
 def test_a_folder_of_plates_is_refused(folder: Path, tmp_path: Path) -> None:
     write_image(folder / "background" / "01" / "000000.png", rec.picture("01", 0))
     with pytest.raises(InputError, match=r"background/01: a folder; give one clean plate a camera, as 01\.png beside"):
