@@ -7,7 +7,7 @@ t_own = (1 + drift_ppm / 10^6) t + offset_s.
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -39,11 +39,11 @@ class _ClockTable(BaseModel):
 @dataclass(frozen=True)
 class InStep:
     """Footage of one camera at the instants of all. own: by instant, counted as the frame numbers of the slowest
-    camera, the camera's own frame number, with its fraction."""
+    camera, the camera's own frame number, with its fraction; fps: of the slowest camera, where its file says."""
 
     source: ImageFolder | Video
     own: dict[int, float]
-    fps: ClassVar[None] = None  # the rate of the instants is not that of the file
+    fps: float | None
 
     @property
     def path(self) -> Path:
@@ -127,7 +127,7 @@ def in_step(
         raise InputError(f"{FILE}: by these clocks the recordings of {', '.join(footage)} do not overlap; correct it")
     numbers = np.asarray(footage[slowest].frames)[shared]
     return {
-        name: InStep(one, dict(zip(numbers.tolist(), own[name][shared].tolist(), strict=True)))
+        name: InStep(one, dict(zip(numbers.tolist(), own[name][shared].tolist(), strict=True)), footage[slowest].fps)
         for name, one in footage.items()
     }
 

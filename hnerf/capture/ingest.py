@@ -124,7 +124,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         test_cameras=tuple(cameras.test),
         train_frames=tuple(frames.train),
         novel_pose_frames=tuple(frames.novel_pose),
-        fps=manifest.fps or min((one.fps for one in filmed.values() if one.fps), default=DEFAULT_FPS),
+        fps=manifest.fps or min((one.fps for one in footage.values() if one.fps), default=DEFAULT_FPS),
         up=manifest.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},

@@ -124,6 +124,15 @@ def test_frames_at_an_uneven_rate_are_taken_by_their_times(tmp_path: Path) -> No
     assert abs(last_s - times_s[round(level / 10)]) <= 0.041  # half of the longer frame duration
 
 
+def test_the_rate_is_that_of_the_camera_whose_frames_are_counted(tmp_path: Path) -> None:
+    """Of 15 frames, the last five of b last twice as long, 19 a second on average; a's 25 a second are counted."""
+    write_video(tmp_path / "film" / "a.mp4", [10 * k for k in range(20)])
+    write_video(tmp_path / "film" / "b.mp4", [10 * k for k in range(15)])
+    hold_frames(tmp_path / "film" / "b.mp4", 10, 5)
+    assert Video.open(tmp_path / "film" / "b.mp4").fps < 20
+    assert ingested(tmp_path / "film", tmp_path / "out").fps == pytest.approx(25)
+
+
 def test_a_rotation_in_the_metadata_is_honoured(tmp_path: Path) -> None:
     video = tmp_path / "a.mp4"
     write_video(video, [200] * 3)
