@@ -102,7 +102,8 @@ def write_clocks(path: Path, clocks: Mapping[str, Clock]) -> None:
 def in_step(
     footage: dict[str, ImageFolder | Video], clocks: Mapping[str, Clock], fps: float
 ) -> dict[str, ImageFolder | Video | InStep]:
-    """Return the footage of all cameras at common instants: the frames of the slowest camera that all recorded.
+    """Return the footage of all cameras at common instants: the frames of the slowest camera that all recorded; of
+    cameras that are equally slow, the first whose frames come evenly, so that their numbers tell the time.
 
     It is the same footage where there are no clocks and no video says that its frames come at an uneven rate. fps: of
     images without a rate of their own. Raises InputError where a clock is missing, or the recordings do not overlap.
@@ -116,7 +117,7 @@ def in_step(
     clocks = clocks or dict.fromkeys(footage, Clock())
     if missing := sorted(set(footage).difference(clocks)):
         raise InputError(f"{FILE}: camera {missing[0]} is missing; run `hnerf synchronise` again, or add it")
-    slowest = max(footage, key=lambda name: round(len(times_s[name]) and _step_s(times_s[name]), 4))
+    slowest = max(footage, key=lambda name: (round(_step_s(times_s[name]), 4), _regular(times_s[name])))
     instants_s = (times_s[slowest] - clocks[slowest].offset_s) / clocks[slowest].rate
     own = {
         name: _frames_at(np.asarray(one.frames), times_s[name], clocks[name].rate * instants_s + clocks[name].offset_s)

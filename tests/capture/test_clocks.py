@@ -68,6 +68,12 @@ def test_frames_that_come_unevenly_are_all_taken_and_none_for_another() -> None:
     assert found["b"].own == pytest.approx({0: 0.4, 1: 1 + 4 / 11, 2: 2 + 3 / 9, 3: 3 + 4 / 30, 6: 4.4})
 
 
+def test_frames_that_come_evenly_are_counted_rather_than_others_of_that_rate() -> None:
+    video = Video(Path("a"), (0, 1, 2, 3, 4), None, (0.0, 0.1, 0.2, 0.3, 0.6))
+    found = in_step({"a": video, "b": images("b", 7, 10)}, {}, 30)
+    assert found["a"].frames == (0, 1, 2, 3, 6)  # of b; a's frame 4 is at 0.6 s
+
+
 def test_recordings_that_do_not_overlap_and_missing_clocks_are_refused() -> None:
     footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
     with pytest.raises(InputError, match="do not overlap"):
