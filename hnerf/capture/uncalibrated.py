@@ -10,7 +10,7 @@ import numpy as np
 from hnerf.capture.footage import Footage
 from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.formats.layout import Layout, StoredFrame
-from hnerf.capture.formats.pose2sim import Pose2Sim, lens_from_table
+from hnerf.capture.formats.pose2sim import lens_from_table
 from hnerf.capture.lens import Lens
 from hnerf.capture.safe_io import (
     VIDEO_SUFFIXES,
@@ -90,7 +90,7 @@ class Uncalibrated(Layout):
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return openpose/<camera>/, else pose/<camera>_json/."""
-        return EasyMocap(self.folder).keypoint_files(camera) or Pose2Sim(self.folder).keypoint_files(camera)
+        return EasyMocap(self.folder).keypoint_files(camera)
 
 
 def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLens:

@@ -11,6 +11,7 @@ import numpy as np
 from hnerf.capture import safe_io
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.formats.layout import Layout, StoredFrame
+from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.lens import Lens, by_name, checked_lens
 from hnerf.errors import InputError
 from hnerf.strict_yaml import parse_yaml_strings
@@ -45,9 +46,9 @@ class EasyMocap(Layout):
         return Video.open(video)
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return openpose/<camera>/<frame>_keypoints.json by frame."""
+        """Return openpose/<camera>/<frame>_keypoints.json by frame, else pose/<camera>_json/ as Pose2Sim does."""
         files = safe_io.files_in(self.folder, "openpose", camera, suffixes=safe_io.JSON_SUFFIXES)
-        return dict(safe_io.numbered(files, "keypoints"))
+        return dict(safe_io.numbered(files, "keypoints")) or Pose2Sim(self.folder).keypoint_files(camera)
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return masks/<camera>/<frame>.png, or mask/, by frame."""

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.formats.pose2sim import Pose2Sim
-from hnerf.capture.ingest import ingest
+from hnerf.capture.ingest import exported_lenses, ingest
 from hnerf.capture.keypoint_sets import is_body_25, to_body_25
 from hnerf.config import CaptureSettings
 from tests.capture import recordings as rec
@@ -76,3 +77,16 @@ def test_keypoint_files_follow_the_numbers_in_their_names(tmp_path: Path) -> Non
         (folder / f"{name}.json").touch()
     files = Pose2Sim(tmp_path).keypoint_files("a")
     assert [Path(str(file)).stem for file in files.values()] == ["walk_9", "walk_10", "walk_\u0663", "\u0663"]
+
+
+def test_keypoints_stay_where_another_calibration_takes_over(tmp_path: Path) -> None:
+    folder = rec.write_pose2sim(tmp_path / "walker")
+    for camera in rec.CAMERAS:
+        for frame in range(10):
+            person = np.tile([10.0 + frame, 20, 0.5], (25, 1))
+            rec.write_keypoints(folder / "pose" / f"cam{camera}_json" / f"cam{camera}_{frame:06d}.json", [person])
+    before = ingest(folder, CaptureSettings(), tmp_path / "before")
+    write_cameras(folder, exported_lenses(folder), "easymocap")
+    after = ingest(folder, CaptureSettings(), tmp_path / "after")
+    found = [capture.keypoints("cam01") for capture in (before, after)]
+    assert found[1] is not None and np.array_equal(*found)
