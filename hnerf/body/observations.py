@@ -1,6 +1,7 @@
 """The subject's keypoints in the form that a fit needs."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -49,12 +50,14 @@ def observe(capture: Capture) -> Observations:
 
 
 def runs(capture: Capture) -> list[tuple[int, ...]]:
-    """Return the frames in runs that follow each other in time: a step in the numbers other than the median one, or a
-    change of split, starts a new run."""
+    """Return the frames in runs that follow each other in time: a step in the numbers other than the median one starts
+    a new run. So does a change of split, if it is the only one: all novel poses may be another recording, appended to
+    the first. Splits that alternate divide a single recording."""
     novel, step = set(capture.novel_pose_frames), median_step(capture.frames)
+    changes = {b for a, b in pairwise(capture.frames) if (a in novel) != (b in novel)}
     found: list[list[int]] = []
     for frame in capture.frames:
-        if found and frame == found[-1][-1] + step and (frame in novel) == (found[-1][-1] in novel):
+        if found and frame == found[-1][-1] + step and changes != {frame}:
             found[-1].append(frame)
         else:
             found.append([frame])

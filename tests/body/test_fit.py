@@ -213,9 +213,12 @@ def test_frames_before_the_person_comes_do_not_count(tmp_path: Path) -> None:
     assert initial_pose(capture, observe(capture), body_model(FitSettings())).root.isfinite().all()
 
 
-def test_runs_break_at_gaps_and_between_splits(tmp_path: Path) -> None:
+def test_runs_break_at_gaps_and_between_two_splits(tmp_path: Path) -> None:
     capture = record(tmp_path, moving_body((0, 1, 2, 5, 6)), RING, ("0",))
-    assert runs(capture) == [(0, 1, 2), (5, 6)]
+    one_split = replace(capture, train_frames=capture.frames, novel_pose_frames=())
+    assert runs(one_split) == [(0, 1, 2), (5, 6)]
+    assert runs(replace(capture, train_frames=(0, 5, 6), novel_pose_frames=(1, 2))) == [(0, 1, 2), (5, 6)]
+    assert runs(replace(capture, train_frames=(0,), novel_pose_frames=(1, 2, 5, 6))) == [(0,), (1, 2), (5, 6)]
 
 
 def test_frames_of_a_stride_follow_each_other(tmp_path: Path) -> None:
