@@ -338,11 +338,17 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
     return overridden(validated(Settings, preset_tree(path), path), overrides)
 
 
-def preset_tree(path: Path) -> dict[str, Any]:
-    """Return the tree in a preset's file, merged over the preset under configs/ that it names as `based_on`, if any."""
+def preset_tree(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return the tree in a preset's file, merged over that of the preset which it names as `based_on`, if any. derived:
+    the presets that are based on this one. Raises InputError where it is among them."""
+    if path.resolve() in derived:
+        raise InputError(f"{path}: is based on itself; correct based_on in it")
     tree = read_yaml(path)
     base = tree.pop("based_on", None)
-    return tree if base is None else _merged(read_yaml(named_file(str(base), CONFIGS, "preset", "presets")), tree)
+    if base is None:
+        return tree
+    below = named_file(str(base), CONFIGS, "preset", "presets")
+    return _merged(preset_tree(below, (*derived, path.resolve())), tree)
 
 
 def overridden(settings: S, overrides: Sequence[str]) -> S:

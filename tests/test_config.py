@@ -126,6 +126,21 @@ def test_a_preset_builds_on_another(tmp_path: Path) -> None:
         load_settings(str(path))
 
 
+def test_a_preset_builds_on_one_that_builds_on_another(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("based_on: nerf-wide\ntraining: {field: {samples: 5}}")
+    wide, mine = load_settings("nerf-wide").training, load_settings(str(path)).training
+    assert mine == wide.model_copy(update={"field": wide.field.model_copy(update={"samples": 5})})
+
+
+def test_a_preset_cannot_build_on_itself(tmp_path: Path) -> None:
+    one, other = tmp_path / "one.yaml", tmp_path / "other.yaml"
+    one.write_text(f"based_on: {other}")
+    other.write_text(f"based_on: {one}")
+    with pytest.raises(InputError, match=rf"^{one}: is based on itself; correct based_on in it$"):
+        load_settings(str(one))
+
+
 def test_a_video_in_place_of_a_preset_is_not_read(tmp_path: Path) -> None:
     """Neither as a preset nor as what one is based on."""
     path = tmp_path / "large.yaml"
