@@ -67,7 +67,8 @@ def verify(options: argparse.Namespace) -> None:
         print(printable(fault))
     print(f"checked: {found.artifacts} artifacts, {found.files} files, {_size(found.size_bytes)}")
     if found.lines:
-        raise InputError(f"{options.store}: {len(found.lines)} faults; repeat the `hnerf run` of what is damaged")
+        remedy = "repeat the `hnerf run` of what is damaged, or let `hnerf store gc --yes` remove what nobody needs"
+        raise InputError(f"{options.store}: {len(found.lines)} faults; {remedy}")
 
 
 def gc(options: argparse.Namespace) -> None:

@@ -17,13 +17,13 @@ from pathlib import Path
 from tasks.inventory import KEY, Inventory, in_stages
 from tasks.store import Store, remove
 
-LEFT = re.compile(rf"({KEY.pattern})(\.partial|\.json\.partial|\.moving|\.shared|\.lock|)")
+LEFT = re.compile(rf"({KEY.pattern})(\.partial|\.json\.partial|\.moving|\.shared|\.lock|\.json|)")
 
 
 @dataclass(frozen=True)
 class Garbage:
-    """Something to remove: the artifact of a key, or what is `left` of work on it that was interrupted. used_s: when it
-    was last used or written, in seconds since 1970."""
+    """Something to remove: the artifact of a key, or what is `left` of work on it that was interrupted, or of one that
+    cannot be found any more. used_s: when it was last used or written, in seconds since 1970."""
 
     stage: str
     key: str
@@ -38,8 +38,8 @@ class Garbage:
 
 
 def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbage]:
-    """Return what the `keep` newest results of no subject need, and what was left by work that was interrupted, as far
-    as nobody has used it for `older_s` seconds."""
+    """Return what the `keep` newest results of no subject need, what was left by work that was interrupted, and what
+    cannot be found any more, as far as nobody has used it for `older_s` seconds."""
     needed = inventory.needed(keep)
     found = [
         Garbage(one.artifact.stage, one.artifact.root.name, (), one.size_bytes, one.used_s)
@@ -74,8 +74,8 @@ def _remove_artifact(store: Store, garbage: Garbage) -> bool:
 
 
 def _remove_left(store: Store, garbage: Garbage) -> bool:
-    folder, record = (store.path(garbage.stage, garbage.key, end) for end in ("", ".json"))
-    finished = folder in garbage.left and record.exists()  # it was about to be recorded
+    own = {store.path(garbage.stage, garbage.key, end) for end in ("", ".json")}
+    finished = not own.isdisjoint(garbage.left) and _can_be_found(store, garbage)  # it was about to be recorded
     if finished or _written_s(garbage.left) > garbage.used_s:  # resumed, and interrupted again
         return False
     for path in garbage.left:
@@ -86,12 +86,26 @@ def _remove_left(store: Store, garbage: Garbage) -> bool:
     return True
 
 
+def _can_be_found(store: Store, garbage: Garbage) -> bool:
+    try:
+        artifact = store.recorded(garbage.stage, garbage.key)
+    except FileNotFoundError:
+        return False
+    return artifact is not None and artifact.root.is_dir()
+
+
 def _left_behind(inventory: Inventory) -> Iterator[Garbage]:
-    """Yield, by key, folders without a record, work in progress, and the locks of keys that have nothing else."""
+    """Yield, by key, folders without a record, work in progress, the locks of keys that have nothing else, and records
+    that cannot be read or have no folder, with what is there, unless it is in use."""
+    used = inventory.used
+    lost = {record for record in inventory.unreadable if f"{record.parent.name}/{record.stem}" not in used}
     left: dict[tuple[str, str], list[Path]] = {}
     for path in in_stages(inventory.store, "*"):
         matched = LEFT.fullmatch(path.name)
-        if matched and (matched[2] or not path.with_name(f"{path.name}.json").exists()):
+        if not matched:
+            continue
+        record = path.with_name(f"{matched[1]}.json")
+        if matched[2] not in ("", ".json") or record in lost or not record.exists():
             left.setdefault((path.parent.name, matched[1]), []).append(path)
     for (stage, key), paths in left.items():
         recorded = inventory.store.path(stage, key, ".json").exists()

@@ -35,7 +35,7 @@ class Stored:
 @dataclass(frozen=True)
 class Inventory:
     """The artifacts of a store by name (`<stage>/<key>`), the latest ones of each subject by stage, and the records
-    that cannot be read."""
+    that cannot be read or have no folder."""
 
     store: Store
     stored: dict[str, Stored]
@@ -88,12 +88,16 @@ class Inventory:
         mine = [self.stored[name] for name, subjects in self.owners.items() if subject in subjects]
         return sorted(mine, key=lambda one: one.made_s)
 
+    @property
+    def used(self) -> set[str]:
+        """Return the names of what subjects link to and running processes use, be it there or not."""
+        return pinned(self.store.root).union(*(links.values() for links in self.latest.values()))
+
     def needed(self, keep: int = 1) -> set[str]:
         """Return the artifacts that the `keep` newest results of every subject need, its links, and what running
         processes use."""
-        roots = pinned(self.store.root)
+        roots = self.used
         for subject, links in self.latest.items():
-            roots |= set(links.values())
             ended_early = "asset" not in links  # a run that replaced the links of a finished one
             newest = [one.artifact for one in self.of_subject(subject)[::-1]] if keep > 1 or ended_early else []
             assets = [one for one in newest if one.stage == "asset"][:keep]  # with which runs end, and nothing else

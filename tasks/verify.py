@@ -33,7 +33,7 @@ def faults(store: Store, subjects: Iterable[str] = ()) -> Checked:
         links = {subject: inventory.latest.get(subject, {}) for subject in wanted}
         names = {one.artifact.name for subject in wanted for one in inventory.of_subject(subject)}
         chosen = [inventory.stored[name] for name in sorted(names)]
-    lines = [] if wanted else [f"{record}: the record cannot be read" for record in inventory.unreadable]
+    lines = [] if wanted else [f"{record}: {_why_unreadable(record)}" for record in inventory.unreadable]
     for subject, latest in links.items():
         lines += [
             f"{store.subject_folder(subject) / stage}: leads nowhere"
@@ -44,6 +44,10 @@ def faults(store: Store, subjects: Iterable[str] = ()) -> Checked:
         lines += _faults(one.artifact)
     count = sum(len(one.artifact.files) for one in chosen)
     return Checked(len(chosen), count, sum(one.size_bytes for one in chosen), lines)
+
+
+def _why_unreadable(record: Path) -> str:
+    return "the record cannot be read" if record.with_suffix("").is_dir() else "its folder is missing"
 
 
 def _faults(artifact: Artifact) -> Iterator[str]:

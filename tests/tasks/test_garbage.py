@@ -3,6 +3,7 @@ import fcntl
 import multiprocessing
 import os
 import re
+import shutil
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -135,6 +136,31 @@ def test_unfinished_work_goes_unless_somebody_is_at_it(store: Store) -> None:
     left = {path.name for path in fit.iterdir()} - {f"{n:032x}{e}" for n in (11, 12) for e in ("", ".json", ".lock")}
     assert left == {f"{91:032x}.partial", f"{91:032x}.lock", "notes.txt"}
     assert (store.root / "subjects" / "ada").is_dir()
+
+
+def test_what_cannot_be_found_goes_unless_a_subject_links_to_it(store: Store) -> None:
+    """A damaged record, and one whose folder was deleted: both would stay for ever, the former with its files."""
+    before, now = run_of(store, "ada", 10), run_of(store, "ada", 20)
+    for training in (before[3], now[3]):
+        record = store.path("training", training.root.name, ".json")
+        record.write_text("{")
+        os.utime(record, (LONG_AGO_S,) * 2)
+    shutil.rmtree(before[2].root)
+    for one in find_garbage(Inventory.of(store), 1, 0):
+        assert collect(store, one)
+    left = {path.name.split(".")[0] for stage in ("fit", "training") for path in (store.root / stage).iterdir()}
+    assert left == {one.root.name for one in now[1:4]} and (now[3].root / "deep" / "letters").exists()
+
+
+def test_a_record_that_was_made_anew_meanwhile_stays(store: Store) -> None:
+    made = add(store, "fit", 90)
+    record = store.path("fit", f"{90:032x}", ".json")
+    text = record.read_text()
+    record.write_text("{")
+    (one,) = find_garbage(Inventory.of(store), 1, 0)
+    record.write_text(text)
+    os.utime(record, (LONG_AGO_S,) * 2)
+    assert not collect(store, one) and store.find("fit", f"{90:032x}") == made
 
 
 def test_people_whose_names_look_like_keys_are_no_garbage(store: Store) -> None:

@@ -30,10 +30,13 @@ def test_what_is_damaged_missing_or_not_of_it_is_named(store: Store) -> None:
     letters[0].write_text("abd")
     (letters[1].parent / "more").touch()
     (store.subject_folder("bob") / "hands").symlink_to(f"../../hands/{99:032x}")
-    store.path("fit", f"{98:032x}", ".json").write_text("[]")
+    for number in (97, 98):
+        store.path("fit", f"{number:032x}", ".json").write_text("[]")
+    store.path("fit", f"{97:032x}").mkdir()
     found = faults(store)
     assert [line.rpartition(": ")[2] for line in found.lines] == [
-        "the record cannot be read", "leads nowhere", "damaged or missing", "not of this artifact"
+        "the record cannot be read", "its folder is missing", "leads nowhere", "damaged or missing",
+        "not of this artifact",
     ]  # fmt: skip
 
 
