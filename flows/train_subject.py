@@ -29,7 +29,7 @@ from tasks.quarantine import clear, note_run
 from tasks.remote import NothingThereError, fetched, remote_capture
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import place, read_capture
-from tasks.store import Artifact, Store
+from tasks.store import OPTIONAL, Artifact, Store
 from tasks.training import train
 
 log = logging.getLogger("hnerf.train")
@@ -88,7 +88,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     artifact_store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
     artifact_store.link_latest(subject, recorded)
     recording = artifact_store.link_latest(subject, with_detections(artifact_store, recorded, settings))
-    artifact_store.unlink_latest(subject, {"detection", "hands"} - {recording.stage})
+    artifact_store.unlink_latest(subject, OPTIONAL - {recording.stage})
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
     segmentation = artifact_store.link_latest(
@@ -112,8 +112,10 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     else:
         results.append(export(artifact_store, recording, calibration, segmentation, training, settings.asset))
         asset = results[-1].root / "avatar.usdz"
+    # Again: another run of this name may have relinked them.
+    artifact_store.unlink_latest(subject, OPTIONAL - {recording.stage})
     for artifact in results:
-        artifact_store.link_latest(subject, artifact)  # again: another run of this name may have relinked them
+        artifact_store.link_latest(subject, artifact)
     trained = Trained(artifact_store.subject_folder(subject), evaluation.root / "report.html", asset)
     pictures = embedded(_key_pictures(calibration, evaluation))
     page = f"{_figures(subject, evaluation, training, trained)}\n\n{pictures}\n"

@@ -11,7 +11,7 @@ from hnerf.errors import InputError
 from hnerf.files import atomic_file
 from tasks.inventory import Inventory
 from tasks.packed import Contents, Name, archived, pack, place, read_contents, require_room, unpack
-from tasks.store import STAGES, Artifact, Store
+from tasks.store import OPTIONAL, STAGES, Artifact, Store
 
 
 class Manifest(Contents):
@@ -70,6 +70,7 @@ def import_subject(store: Store, path: Path) -> Manifest:
         if manifest.recording:
             digest, _, folder = manifest.recording.strip().partition("\n")
             store.claim(manifest.subject, digest, folder)
+        store.unlink_latest(manifest.subject, OPTIONAL - manifest.latest.keys())
         for stage in sorted(manifest.latest, key=STAGES.index):
             store.link_latest(manifest.subject, _intact(store, *manifest.latest[stage].split("/")))
     return manifest

@@ -45,6 +45,7 @@ MAX_RECORD_BYTES = 256_000_000  # a million files need half of that
 ATTEMPTS = 100  # to lock a key in a folder that others make and remove
 # In order: each stage is computed from those before it.
 STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
+OPTIONAL = {"detection", "hands"}  # of these, a run may do without
 
 NAME = re.compile(r"[a-z][a-z-]{0,30}/[0-9a-f]{32}")  # of an artifact
 SizeBytes = Annotated[int, Field(ge=0, lt=2**63)]  # of a file
@@ -181,16 +182,21 @@ class Store:
         if link.is_symlink() and os.readlink(link) == target:
             return artifact
         link.parent.mkdir(parents=True, exist_ok=True)
-        if link.is_symlink():  # what was computed from an earlier artifact no longer belongs to the subject
-            for stage in STAGES[STAGES.index(artifact.stage) + 1 :]:
-                (link.parent / stage).unlink(missing_ok=True)
+        # What was computed from an earlier artifact, or from none, no longer belongs to the subject.
+        self._unlink_from(subject, STAGES.index(artifact.stage) + 1)
         with atomic_file(link) as beside:
             beside.symlink_to(target)
         return artifact
 
     def unlink_latest(self, subject: str, stages: Iterable[str]) -> None:
-        """Remove a subject's links to artifacts of these stages, which the latest run did without."""
+        """Remove a subject's links to artifacts of these stages, which the latest run did without, and to what was
+        computed from them."""
         for stage in stages:
+            if (self.subject_folder(subject) / stage).is_symlink():
+                self._unlink_from(subject, STAGES.index(stage))
+
+    def _unlink_from(self, subject: str, first: int) -> None:
+        for stage in STAGES[first:]:
             (self.subject_folder(subject) / stage).unlink(missing_ok=True)
 
     def claim(self, subject: str, digest: str, folder: Path | str) -> None:

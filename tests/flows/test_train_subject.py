@@ -144,6 +144,21 @@ def test_a_run_names_its_own_results_whoever_ends_last(folder: Path, tmp_path: P
     assert (first.report.parent / "given.json").exists()
 
 
+def test_hands_that_a_run_beside_it_found_are_not_shown(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both are of one recording, with other settings."""
+    evaluate = module.evaluate
+
+    def linked(artifact_store: store.Store, *inputs: Any) -> Artifact:
+        artifact_store.link_latest("ada", artifact_store.get_or_compute("hands", "k", lambda out: {}))
+        return evaluate(artifact_store, *inputs)
+
+    monkeypatch.setattr(module, "evaluate", linked)
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
+    assert {path.name for path in subject.iterdir() if path.is_symlink()} == set(store.STAGES) - store.OPTIONAL
+
+
 def test_another_recording_of_the_same_name_is_said(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -18,7 +18,7 @@ from tasks.inventory import Inventory, recording_of
 from tasks.packed import manifest_name
 from tasks.store import RECORDING, Store
 from tasks.verify import faults
-from tests.tasks.stores import names, run_of
+from tests.tasks.stores import add, names, run_of
 
 
 @pytest.fixture
@@ -71,6 +71,16 @@ def test_a_run_beside_it_that_has_some_keeps_them(packed: Path, tmp_path: Path) 
     import_subject(store, packed)
     assert (made.root / "deep" / "letters").stat().st_nlink == 1
     assert names([made]) <= Inventory.of(store).stored.keys()
+
+
+def test_hands_that_the_results_did_without_are_not_linked(packed: Path, tmp_path: Path) -> None:
+    """The recording is the same, and so are the links to it."""
+    store = Store(tmp_path / "to")
+    import_subject(store, packed)
+    capture = Inventory.of(store).stored[f"capture/{10:032x}"].artifact
+    store.link_latest("ada", add(store, "hands", 30, capture))
+    import_subject(store, packed)
+    assert Inventory.of(store).latest == {"ada": Inventory.of(Store(tmp_path / "from")).latest["ada"]}
 
 
 def test_a_recording_in_a_bucket_keeps_its_url(tmp_path: Path) -> None:

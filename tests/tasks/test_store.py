@@ -354,6 +354,13 @@ def test_hands_of_another_recording_replace_those_before(tmp_path: Path) -> None
     assert [path.name for path in (tmp_path / "subjects" / "ada").iterdir()] == ["hands"]
 
 
+def test_what_was_made_without_hands_goes_when_there_are_some(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for stage in ("capture", "fit", "asset", "hands"):
+        store.link_latest("ada", store.get_or_compute(stage, "k", write_abc))
+    assert sorted(path.name for path in (tmp_path / "subjects" / "ada").iterdir()) == ["capture", "hands"]
+
+
 def test_view_never_mixes_what_was_made_from_other_things(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("fit", "training", "asset"):
@@ -368,8 +375,10 @@ def test_view_forgets_stages_that_a_run_did_without(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("capture", "hands", "fit"):
         store.link_latest("ada", store.get_or_compute(stage, "k", write_abc))
-    store.unlink_latest("ada", {"detection", "hands"})
-    assert sorted(path.name for path in (tmp_path / "subjects" / "ada").iterdir()) == ["capture", "fit"]
+    store.unlink_latest("ada", {"detection"})
+    assert sorted(path.name for path in (tmp_path / "subjects" / "ada").iterdir()) == ["capture", "fit", "hands"]
+    store.unlink_latest("ada", {"detection", "hands"})  # from which the fit was computed
+    assert sorted(path.name for path in (tmp_path / "subjects" / "ada").iterdir()) == ["capture"]
 
 
 @pytest.mark.parametrize("name", ["", "..", "../../home", "a/b"])
