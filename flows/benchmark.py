@@ -125,17 +125,19 @@ def train_until_flat(
     store: Store, truth: Source, prepared: Prepared, plan: BenchmarkStudy, method: str
 ) -> tuple[Settings, dict[str, Any]]:
     """Train for longer and longer; return the settings of the last training, and the curve of all and why there are no
-    longer ones. A training that fails has no point: it may be too young for a surface."""
+    longer ones. A training that fails has no point, as it may be too young for a surface; if the longest does, its
+    error is raised."""
     assert plan.seconds is not None
     recording, calibration, _, body = prepared
     points: list[dict[str, Any]] = []
-    for limit_s in training_limits_s(plan.seconds):
+    limits_s = training_limits_s(plan.seconds)
+    for limit_s in limits_s:
         settings, ended = plan.settings(method, limit_s), "limit"
         try:
             training = train(store, *prepared, settings.training)
             point = score_end_of_training(store, truth, recording, calibration, body, training, plan.scoring)
         except Exception as error:
-            if is_of_the_machine(error):
+            if is_of_the_machine(error) or limit_s == limits_s[-1]:  # which would only be trained again
                 raise
             log.warning("after %g s: %s", limit_s, one_line(error))
             continue

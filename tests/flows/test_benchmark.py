@@ -161,6 +161,16 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
     assert found["variants"]["one"]["methods"]["nerf"]["ended"] == "limit"
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_method_that_always_fails_is_trained_once_for_each_time(stages: Stages, tmp_path: Path) -> None:
+    text = "title: t\nmethods: [fast]\nvariants: {one: {}}\nuntil_flat: true\nsnapshots: 0\nseconds: 40"
+    (tmp_path / "mine.yaml").write_text(text)
+    stages.fails["fast"] = InputError("the surface is empty")
+    found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))
+    assert found["variants"]["one"]["methods"]["fast"] == {"error": "the surface is empty"}
+    assert [training.seconds for _, training in stages] == [10.0, 20.0, 40.0]
+
+
 @pytest.mark.parametrize("lacks", ["test cameras", "masks"])
 def test_nothing_is_trained_until_flat_where_no_image_can_be_scored(
     stages: Stages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lacks: str
