@@ -133,7 +133,7 @@ def add_store_commands(store: argparse.ArgumentParser) -> None:
         type=_at_least_one,
         default=1,
         metavar="N",
-        help="keep the results of the N newest runs of each subject (default: 1)",
+        help="keep the results of the N newest runs of each subject that made an asset (default: 1)",
     )
     added["gc"].add_argument(
         "--older",
