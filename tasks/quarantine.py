@@ -10,7 +10,10 @@ from hnerf.files import replace_text
 from tasks.ledger import was_started
 
 FOLDER = ".refused"
-REMEDY = "Correct the folder: a capture that has changed is tried again by itself. To remove this note, remove it."
+REMEDY = (
+    "Correct the folder: a capture that has changed is tried again by itself. If the folder is not to blame, repeat "
+    "its flow run: prefect flow-run retry ID. This note goes when a run succeeds, or with the folder."
+)
 
 
 def note(capture: Path, why: str) -> None:
