@@ -66,13 +66,16 @@ def ingest_captures(
         capture = place(lost.parameters["capture"])
         quarantine.note_run(capture, store, f"failed: {why} (flow run {lost.name}, {lost.id})")
     started: list[str] = []
-    room = max_unfinished
-    for capture, listing, digest in _unseen(folder, ledger, settle_s):
+    room: int | None = None
+    for capture, listing in _unseen(folder, ledger, settle_s):
+        room = max_unfinished - unfinished_runs() if room is None else room
+        if len(started) >= room:  # before the capture is read, which every look would do again
+            log.info("%s and what follows wait: %d runs have not ended", capture, max_unfinished)
+            break
+        digest = _digest(capture, listing)
+        if digest is None:
+            continue
         if not ledger.knows(digest):
-            room = room if started else max_unfinished - unfinished_runs()
-            if len(started) >= room:
-                log.info("%s and what follows wait: %d runs have not ended", capture, max_unfinished)
-                break
             parameters = {"capture": str(capture), "preset": preset, "store": str(store.resolve())}
             key = ledger.start_key(digest)
             run = run_deployment(DEPLOYMENT, parameters=parameters, timeout=0, as_subflow=False, idempotency_key=key)
@@ -99,9 +102,9 @@ def _has_room(store: Path, min_free_gib: float) -> bool:
     return False
 
 
-def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tuple[Path | str, str, str]]:
-    """Yield the captures of a folder that are complete and were not seen before, with the digests of their listing and
-    of their content; note why one cannot be read."""
+def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tuple[Path | str, str]]:
+    """Yield the captures of a folder that are complete and were not seen before, with the digests of their listing;
+    note why one cannot be read."""
     if isinstance(folder, str):
         yield from _unseen_in_bucket(folder, ledger, settle_s)
         return
@@ -109,21 +112,38 @@ def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tup
         try:
             listing, touched_s = _listing(capture)
             if touched_s and time.time() - touched_s >= settle_s and not ledger.seen(listing):
-                yield capture, listing, read_capture(capture)[0].digest
+                yield capture, listing
         except FileNotFoundError as error:  # removed meanwhile
             log.error("%s", error)
         except (InputError, OSError) as error:
-            log.error("%s", error)
-            with suppress(OSError):  # a folder that may only be read
-                quarantine.note(capture, f"refused: {error}")
+            _refuse(capture, error)
 
 
-def _unseen_in_bucket(folder: str, ledger: Ledger, settle_s: float) -> Iterator[tuple[str, str, str]]:
-    """Yield the same of captures in a bucket, whose listing stands for their content."""
+def _unseen_in_bucket(folder: str, ledger: Ledger, settle_s: float) -> Iterator[tuple[str, str]]:
+    """Yield the same of captures in a bucket."""
     for capture in remote_captures(folder):
         listing = f"seen-{capture.digest}"
         if not ledger.seen(listing) and ledger.stood_s(listing) >= settle_s:
-            yield capture.url, listing, capture.digest
+            yield capture.url, listing
+
+
+def _digest(capture: Path | str, listing: str) -> str | None:
+    """Return the digest of a capture's content, for which its listing stands in a bucket; None, with a note, if it
+    cannot be read."""
+    if isinstance(capture, str):
+        return listing.removeprefix("seen-")
+    try:
+        return read_capture(capture)[0].digest
+    except (InputError, OSError) as error:
+        _refuse(capture, error)
+        return None
+
+
+def _refuse(capture: Path, error: Exception) -> None:
+    """Note why a capture cannot be read."""
+    log.error("%s", error)
+    with suppress(OSError):  # a folder that may only be read
+        quarantine.note(capture, f"refused: {error}")
 
 
 def _captures(folder: Path) -> Iterator[Path]:

@@ -257,6 +257,15 @@ def test_no_more_is_started_than_may_wait(
     assert look(watched, max_unfinished=3) == ["new1", "new2"]
 
 
+def test_what_waits_is_not_read(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every look would read it again, which takes minutes."""
+    reads = Mock(side_effect=read_capture)
+    monkeypatch.setattr(module, "read_capture", reads)
+    monkeypatch.setattr(module, "unfinished_runs", lambda: 2)
+    assert look(watched, max_unfinished=2) == [] and reads.call_count == 0
+    assert look(watched, max_unfinished=3) == ["ada"] and reads.call_count == 1
+
+
 def test_links_out_of_the_folder_are_not_followed(watched: Path, caplog: pytest.LogCaptureFixture) -> None:
     (watched / "ada").rename(watched.parent / "elsewhere")
     (watched / "ada").symlink_to(watched.parent / "elsewhere")
