@@ -441,6 +441,8 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
                 key.append(str(part))
         key += [str(part) for part in first["loc"][-1:] if first["type"] == "missing"]
         wrong, advice = first["msg"].removeprefix("Value error, "), "correct it"
+        if first["type"] == "union_tag_not_found":
+            wrong, advice = f"{first['ctx']['discriminator']} is missing", "add it"
         if first["type"] == "extra_forbidden":
             close = difflib.get_close_matches(key[-1], _keys(kind.model_json_schema()), 1, CLOSE)
             wrong, advice = "no such key", f"did you mean {close[0]}?" if close else "remove it, or correct its name"

@@ -115,6 +115,13 @@ def test_an_override_of_endless_depth_is_one_line() -> None:
         load_settings("fast", [f"{key}=1", f"{key}=2"])
 
 
+def test_a_field_without_its_kind_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("training: {field: {samples: 5}}")
+    with pytest.raises(InputError, match=rf"^{path}: training\.field: 'kind' is missing; add it$"):
+        load_settings(str(path))
+
+
 def test_a_preset_builds_on_another(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("based_on: nerf\ntraining: {field: {width: 5}}")
