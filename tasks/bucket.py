@@ -3,6 +3,7 @@
 Objects must appear whole or not at all, as in object stores; on a local or mounted disk they are renamed into place.
 """
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -21,6 +22,7 @@ from hnerf.progress import report
 
 VARIABLE = "HNERF_BUCKET"
 MAX_NOTE_BYTES = 1000
+FULL = (errno.ENOSPC, errno.EDQUOT)  # of a mounted bucket, or of this machine's disk
 
 
 @dataclass(frozen=True)
@@ -183,7 +185,9 @@ class Bucket:
         except PermissionError as error:
             raise PlaceError(f"{self.where(name)}: {one_line(error)}; allow this user to read and write it") from error
         except Exception as error:
-            raise BucketError(f"{self.where(name)}: {one_line(error)}; can the bucket be reached?") from error
+            full = isinstance(error, OSError) and error.errno in FULL
+            advice = "make room" if full else "can the bucket be reached?"
+            raise BucketError(f"{self.where(name)}: {one_line(error)}; {advice}") from error
 
 
 def is_visible(name: str) -> bool:

@@ -49,6 +49,13 @@ def test_objects_are_made_read_replaced_and_removed(tmp_path: Path) -> None:
         bucket.download("a/b", tmp_path / "there")
 
 
+def test_a_full_disk_is_not_taken_for_a_bucket_that_is_away(tmp_path: Path) -> None:
+    """That of the machine, onto which an object is written."""
+    (tmp_path / "object").write_text("abc")
+    with pytest.raises(BucketError, match=r"object: .*No space left on device; make room$"):
+        Bucket.at(f"file://{tmp_path}").download("object", Path("/dev/full"))
+
+
 def test_an_upload_that_ends_half_way_leaves_the_object_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
