@@ -53,10 +53,11 @@ def benchmark(
     """
     whole = load_study(study)
     plan = whole.restricted_to(methods or [], seconds)
-    capture_settings = [plan.settings(name).capture for name in plan.methods]  # invalid presets are refused first
+    first, *_ = [plan.settings(name) for name in plan.methods]  # invalid presets are refused first
+    set_limits(first.limits)
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    recorded = Capture.load(ingest(artifact_store, source, capture_settings[0]).root)
+    recorded = Capture.load(ingest(artifact_store, source, first.capture).root)
     if plan.until_flat and not (recorded.test_cameras and truth_of(truth.root, recorded).has_masks):
         raise InputError(
             f"{recorded.name}: no image can be scored, so no curve can become flat; add test cameras with masks, or "

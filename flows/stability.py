@@ -122,7 +122,6 @@ def _runs(
 def _runs_of_seed(method: str, as_recorded: "Attempt", tried: Sequence[tuple[str, float]]) -> Iterator[Figures]:
     """Yield the reference run and, unless it is broken, a run for each kind and strength."""
     seed = as_recorded.settings.training.seed
-    set_limits(as_recorded.settings.limits)
     log.info("%s, seed %d, as recorded", method, seed)
     good = as_recorded.outcome()
     row = {"method": method, "seed": seed}
@@ -138,7 +137,9 @@ def _runs_of_seed(method: str, as_recorded: "Attempt", tried: Sequence[tuple[str
 
 
 def ingest_part(store: Store, source: Source, plan: StabilityStudy, settings: Settings) -> Artifact:
-    """Ingest the recording, or that part of it which the study uses."""
+    """Ingest the recording, or that part of it which the study uses, within the limits of these settings, which then
+    apply to what follows."""
+    set_limits(settings.limits)
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     parts = plan.part.select(Capture.load(recording.root))
     return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)

@@ -19,6 +19,7 @@ from hnerf.study.benchmark import publish as publish_module
 from hnerf.study.benchmark.plan import ScoringSettings
 from tasks import benchmark as tasks_module
 from tasks.launcher import LostWorkerError
+from tasks.limits import current_limits
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
 from tests.study.benchmark.test_results import scores
@@ -169,6 +170,17 @@ def test_a_method_that_always_fails_is_trained_once_for_each_time(stages: Stages
     found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))
     assert found["variants"]["one"]["methods"]["fast"] == {"error": "the surface is empty"}
     assert [training.seconds for _, training in stages] == [10.0, 20.0, 40.0]
+
+
+def test_the_recording_is_read_within_the_limits_of_the_preset(
+    stages: Stages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "large.yaml").write_text("based_on: fast\nlimits: {reader_gib: 64}")
+    text = f"title: t\nmethods: [{tmp_path / 'large.yaml'}]\nvariants: {{one: {{}}}}"
+    (tmp_path / "mine.yaml").write_text(text)
+    monkeypatch.setattr(module, "ingest", lambda *_: pytest.fail(f"{current_limits().reader_gib:g} GiB"))
+    with pytest.raises(pytest.fail.Exception, match=r"^64 GiB"):
+        benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store")
 
 
 @pytest.mark.parametrize("lacks", ["test cameras", "masks"])
