@@ -173,8 +173,9 @@ class Capture:
         instead.
         """
         stored = self.stored_frames or self.frames
+        present = frozenset(stored)
         for step in (self.frame_step, median_step(stored)):
-            kept = {f for f in stored if all(nearest_frame(f, o, step) in stored for o in frame_offsets.values())}
+            kept = {f for f in stored if all(nearest_frame(f, o, step) in present for o in frame_offsets.values())}
             if 2 * len(kept) >= len(stored):
                 break
         return dataclasses.replace(

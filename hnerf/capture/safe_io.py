@@ -264,7 +264,7 @@ def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.
         with Image.open(path, formats=["JPEG", "PNG"]) as image:
             check_image_size(path, *image.size)
             if image.mode not in _IMAGE_MODES:
-                raise InputError(f"{path}: pixels are {image.mode}; export it again with 8 bits a channel")
+                raise InputError(f"{path}: pixels are {image.mode}; export it again as RGB or grey, 8 bits a channel")
             image.load()
         turn = _UPRIGHT.get(_orientation(image))
         image = wanted(image)

@@ -27,8 +27,8 @@ def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray,
     hands.
 
     Interpolates linearly between neighbours one median step apart; elsewhere (where a recording ends or jumps) takes
-    the frame within half a frame, or nobody without one. A keypoint that only the nearer neighbour shows is taken from
-    there.
+    the frame within half such a step, or nobody without one. A keypoint that only the nearer neighbour shows is taken
+    from there.
     """
     recorded = np.asarray(frames)
     after = np.searchsorted(recorded, instants).clip(1, max(1, len(recorded) - 1)) % len(recorded)
@@ -36,12 +36,13 @@ def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray,
     gap = (recorded[after] - recorded[before]).clip(1)
     share = ((instants - recorded[before]) / gap).clip(0, 1)
     nearer, farther = np.where(share < 0.5, (before, after), (after, before))
-    between = (share > 0) & (share < 1) & (gap <= median_step(frames))
+    step = median_step(frames)
+    between = (share > 0) & (share < 1) & (gap <= step)
     resampled = keypoints[nearer].copy()
     mix = _mixed if in_order else _between
     for i in np.flatnonzero(between):
         resampled[i] = mix(keypoints[nearer[i]], keypoints[farther[i]], max(share[i], 1 - share[i]))
-    resampled[(np.abs(instants - recorded[nearer]) > 0.5) & ~between] = 0
+    resampled[(np.abs(instants - recorded[nearer]) > step / 2) & ~between] = 0
     return resampled
 
 

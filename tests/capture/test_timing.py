@@ -21,9 +21,11 @@ def test_nearest_frame_by_hand() -> None:
 def test_keypoints_between_frames_by_hand() -> None:
     moving = np.stack([people_at(10 * frame) for frame in range(4)])
     found = resample(moving, range(4), np.array([1.25, 2.0, 3.4, 3.6, -0.6]))
-    # Between frames linearly; beyond the ends as at the ends for half a frame, then nobody.
+    # Between frames linearly; beyond the ends as at the ends for half a step, then nobody.
     np.testing.assert_allclose(found[:3, 0, 0], [[12.5, 0, 0.8], [20, 0, 0.8], [30, 0, 0.8]])
     assert not found[3:].any()
+    strided = resample(moving, (0, 5, 10, 15), np.array([2.0, 17.0, 18.0]))
+    assert strided[:, 0, 0].tolist() == [[4, 0, 0.8], [30, 0, 0.8], [0, 0, 0]]
 
 
 def test_keypoints_do_not_cross_a_gap() -> None:

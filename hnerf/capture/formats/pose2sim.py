@@ -73,5 +73,9 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
             t_m=np.array(table["translation"], dtype=np.float64),
             size_px=(float(width_px), float(height_px)),
         )
-    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise InputError(f"{source}: camera {key[:80]}: {error} is missing or not a number; calibrate again") from None
+    except KeyError as error:
+        raise InputError(f"{source}: camera {key[:80]}: {error} is missing; calibrate again") from None
+    except (AttributeError, OverflowError, TypeError, ValueError):
+        raise InputError(
+            f"{source}: camera {key[:80]}: its table, or a value in it, is not what it must be; calibrate again"
+        ) from None
