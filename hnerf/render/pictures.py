@@ -2,6 +2,7 @@
 image."""
 
 import math
+import shutil
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -35,12 +36,18 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
     """
     for kind in what:
         (out / kind).mkdir(parents=True)
+    meshes: dict[int, Path] = {}  # by frame: an orbit round one pose shows it many times
     for number, shot in enumerate(tracked(shots, "rendering", len(shots))):
         images = _render_kinds(avatar, shot, what)
         for kind, image in images.items():
             write_image(out / kind / f"{number:06d}.png", image)
         if "mesh" in what:
-            posed_surface(avatar, shot[1]).export(out / "mesh" / f"{number:06d}.ply")
+            mesh = out / "mesh" / f"{number:06d}.ply"
+            if shot[1] in meshes:
+                shutil.copyfile(meshes[shot[1]], mesh)
+            else:
+                posed_surface(avatar, shot[1]).export(mesh)
+                meshes[shot[1]] = mesh
     for kind in [kind for kind in what if kind != "mesh"]:
         read = partial(read_depth_grey, span_mm=depth_span_mm(out / kind)) if kind == "depth" else read_rgb
         write_video(out / kind, fps, out / f"{kind}.mp4", read)

@@ -7,7 +7,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from hnerf.avatar.avatar import Rendering
+from hnerf.avatar import surface
+from hnerf.avatar.avatar import Avatar, Rendering
 from hnerf.capture.footage import Video
 from hnerf.geometry.camera import Camera
 from hnerf.render import pictures
@@ -93,6 +94,22 @@ def test_every_kind_is_written_for_every_shot(tmp_path: Path, monkeypatch: pytes
         np.testing.assert_allclose(mesh.extents, 2 * RADIUS_M, atol=2e-3)
     depth = cv2.imread(str(tmp_path / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED)
     assert depth[31, 31] == pytest.approx(650, abs=1)
+
+
+def test_the_surface_of_a_frame_is_extracted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hnerf.avatar.surface.POSED_CELLS", 24)
+    extracted = []
+
+    def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
+        extracted.append(frame)
+        return surface.posed_surface(avatar, frame)
+
+    monkeypatch.setattr(pictures, "posed_surface", posed_surface)
+    shots = [(CAMERA, 3), (CAMERA, 0), (ball_camera("b", 90.0), 3), (ball_camera("b", 90.0), 0)]
+    write_pictures(SolidBall(ball_fit()), shots, ("mesh",), 5.0, tmp_path)
+    assert extracted == [3, 0]
+    written = [(tmp_path / "mesh" / f"{number:06d}.ply").read_bytes() for number in range(4)]
+    assert written[2:] == written[:2] and written[0] != written[1]
 
 
 def test_every_kind_of_image_is_a_video_too(tmp_path: Path) -> None:
