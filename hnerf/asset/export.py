@@ -106,11 +106,13 @@ def export_asset(
     validation, or the asset is far below its field (`require_close`).
     """
     seconds: dict[str, float] = {}
+    own = avatar.without_frames().body.to("cpu")  # the unclothed body, beside which further motions are put
+    added = {name: (retarget(own, motion, capture.up), motion.fps) for name, motion in (further or {}).items()}
     meshes = _rest_meshes(avatar, settings, seconds)
     names = list(meshes.by_topology) if settings.topology == "both" else [settings.topology]
-    asset = _mesh_asset(capture, masks, avatar, meshes, names[0], settings, further or {})
+    asset = _mesh_asset(capture, masks, avatar, meshes, names[0], settings, added)
     bare = settings.model_copy(update={"splats": 0})  # the first mesh alone has splats
-    others = [_mesh_asset(capture, masks, avatar, meshes, name, bare, further or {}) for name in names[1:]]
+    others = [_mesh_asset(capture, masks, avatar, meshes, name, bare, added) for name in names[1:]]
     captured = others[0] if others else None
     surface, staged, splats = asset.surface, asset.staged, asset.splats
     seconds |= asset.seconds
@@ -163,9 +165,10 @@ def _mesh_asset(
     meshes: RestMeshes,
     topology: str,
     settings: AssetSettings,
-    further: Mapping[str, Motion],
+    added: Mapping[str, tuple[BodyFit, float]],
 ) -> MeshAsset:
-    """Texture, rig and move one of the meshes, and compare it with the field; InvalidAsset if it is far below."""
+    """Texture, rig and move one of the meshes, and compare it with the field; InvalidAsset if it is far below. added:
+    further motions on the unclothed body, with their frames a second, by name."""
     seconds: dict[str, float] = {}
     timeless = avatar.without_frames()  # one texture serves all frames
     with _timed("correctives", seconds):
@@ -179,11 +182,6 @@ def _mesh_asset(
         px = settings.normal_map_px
         normals = normal_map(timeless, surface.mesh, layout, px) if px else None
     with _timed("staging", seconds):
-        own = timeless.body.to("cpu")  # the unclothed body, beside which further motions are put
-        added = {
-            name: (dataclasses.replace(retarget(own, motion, capture.up), rig=surface.mesh.rig), motion.fps)
-            for name, motion in further.items()
-        }
         staged = stage_avatar(
             surface.body,
             surface.surfaces_m,
@@ -193,7 +191,7 @@ def _mesh_asset(
             capture.up,
             capture.fps,
             settings.bones,
-            added,
+            {name: (dataclasses.replace(body, rig=surface.mesh.rig), fps) for name, (body, fps) in added.items()},
             albedo,
             normals,
             settings.level_faces,

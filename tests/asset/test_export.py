@@ -16,7 +16,7 @@ from hnerf.body.base_mesh import base_mesh
 from hnerf.body.rig import pose_vertices
 from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings, overridden
-from hnerf.errors import InvalidAsset
+from hnerf.errors import InputError, InvalidAsset
 from hnerf.render.motion import Motion, select_poses
 from tests.asset.figure import bending_body, capture, column_rig
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar
@@ -147,6 +147,17 @@ def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path) -> None:
             corners = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Body/Surface")).GetFaceVertexCountsAttr().Get()
             triangles.append(int(np.sum(np.array(corners) - 2)))
         assert triangles == [faces, one["mesh"]["faces"]], name
+
+
+def test_a_motion_that_lacks_a_joint_is_refused_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hnerf.asset.export._rest_meshes", lambda *_: pytest.fail("a surface was extracted"))
+    body = bending_body()
+    names = tuple(f"other {name}" for name in body.rig.joint_names)
+    strange = Motion(dataclasses.replace(body, rig=dataclasses.replace(body.rig, joint_names=names)), 25.0, "z")
+    with pytest.raises(InputError, match="has no joint"):
+        export_asset(capture(), Masks({}, {}), StandInAvatar(body), SMALL, tmp_path, "", {"nod": strange})
 
 
 def test_nothing_is_written_of_an_asset_far_below_its_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
