@@ -51,9 +51,12 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
         "recording": _packed(json.dumps(recording(capture, stage_from_world)).encode()),
     }
     template = report_environment(PAGE).get_template("viewer.html")
+    written, before = glb.read_bytes(), b""
     for texture_px in TEXTURES_PX:
-        avatar = _packed(compact_glb(glb.read_bytes(), texture_px))
-        page = template.render(avatar=avatar, **parts)
+        compact = compact_glb(written, texture_px)
+        if compact == before:  # its texture was no larger anyway
+            continue
+        before, page = compact, template.render(avatar=_packed(compact), **parts)
         if len(page.encode()) <= MAX_BYTES:
             break
     else:

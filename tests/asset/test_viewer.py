@@ -102,6 +102,19 @@ def test_every_import_is_in_the_page(viewer: Path) -> None:
 
 
 @NEEDS_THREE
+def test_a_page_is_packed_once_a_size_of_its_texture(
+    viewer: Path, photographed: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The avatar's texture has 64 px: three of the sizes are no smaller."""
+    packed: list[bytes] = []
+    monkeypatch.setattr("hnerf.asset.viewer._packed", lambda content: packed.append(content) or "")
+    monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", 1)
+    monkeypatch.setattr("hnerf.asset.viewer.TEXTURES_PX", (256, 128, 64, 32, 16))
+    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
+    assert [content[:4] for content in packed].count(b"glTF") == 3
+
+
+@NEEDS_THREE
 def test_a_page_that_is_too_large_gets_a_smaller_texture(
     viewer: Path,
     photographed: Capture,
