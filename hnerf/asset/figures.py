@@ -54,8 +54,11 @@ def rig_figures(staged: StagedAvatar, name: str) -> dict[str, float]:
     """Return a rig's size, and how far it moves the captured surfaces from where the full rig has them: what 99 % of
     the points stay below in all frames, and the furthest."""
     rig, full = staged.rigs[name], staged.rigs[FULL]
-    pairs = zip(rig.surfaces_m(CAPTURED, staged.rest), full.surfaces_m(CAPTURED, staged.rest), strict=True)
-    worst_m = np.max([np.linalg.norm(moved - true, axis=1) for moved, true in pairs], 0)
+    worst_m = np.zeros(len(staged.rest_points_m))
+    if rig is not full:
+        pairs = zip(rig.surfaces_m(CAPTURED, staged.rest), full.surfaces_m(CAPTURED, staged.rest), strict=True)
+        for moved, true in pairs:
+            worst_m = np.maximum(worst_m, np.linalg.norm(moved - true, axis=1))
     return {
         "joints": len(rig.skeleton.names),
         "influences": rig.skin.influences,
