@@ -69,4 +69,5 @@ def require_poses(subject: Path, what: str) -> None:
     with readable(subject / "training"):
         reason = reason_without_novel_poses(subject / "training")
     if reason:
-        raise InputError(f"{subject}: {reason}; {what} needs new poses: train with preset fast or paper")
+        advice = "train with preset fast, or with paper on several frames"
+        raise InputError(f"{subject}: {reason}; {what} needs new poses: {advice}")

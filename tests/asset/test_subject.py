@@ -60,7 +60,7 @@ def test_an_unfinished_subject_is_refused(tmp_path: Path) -> None:
 def test_a_model_of_moments_has_no_asset(preset: str, tmp_path: Path) -> None:
     """At rest, only what the body's box shares with the recorded moment would be left of it."""
     with_model(made(tmp_path / "ada"), preset)
-    with pytest.raises(InputError, match="an asset needs new poses: train with preset fast or paper"):
+    with pytest.raises(InputError, match="new poses: train with preset fast, or with paper on several frames"):
         export_subject(tmp_path / "ada", AssetSettings(), [], tmp_path / "out", "")
 
 
