@@ -63,7 +63,10 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
         motion = _motion(subject, options, capture)
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
-        write_pictures(avatar_of(subject).with_body(motion.body), shots, options.what, motion.fps, partial)
+        avatar = avatar_of(subject)
+        if options.between is not None:  # the first and the last pose alone would have a frame's own deformation
+            avatar = avatar.without_frames()
+        write_pictures(avatar.with_body(motion.body), shots, options.what, motion.fps, partial)
     return len(shots)
 
 
