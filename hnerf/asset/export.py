@@ -107,7 +107,10 @@ def export_asset(
     """
     seconds: dict[str, float] = {}
     own = avatar.without_frames().body.to("cpu")  # the unclothed body, beside which further motions are put
-    added = {name: (retarget(own, motion, capture.up), motion.fps) for name, motion in (further or {}).items()}
+    added = {
+        name: (retarget(own, motion, capture.up, f"motion {name}"), motion.fps)
+        for name, motion in (further or {}).items()
+    }
     meshes = _rest_meshes(avatar, settings, seconds)
     names = list(meshes.by_topology) if settings.topology == "both" else [settings.topology]
     asset = _mesh_asset(capture, masks, avatar, meshes, names[0], settings, added)

@@ -89,14 +89,14 @@ def select_poses(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
     return dataclasses.replace(body, frames=frames, theta=body.theta[chosen], root=body.root[chosen])
 
 
-def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
+def retarget(own: BodyFit, motion: Motion, up: str, source: object = "motion") -> BodyFit:
     """Return the motion's poses on the rig of `own`, with the rotations of joints matched by name.
 
     The middle of the hips goes the way that it goes on the motion's own body, unscaled, so that legs which stand keep
     standing while the trunk bends. It is moved so that its mean position coincides with that of `own`, and the motion's
     floor, which 5 % of its frames reach below, with that of `own`, the median of its lowest points, on which the asset
     stands. In each frame the lowest point keeps the height above the floor that it had on the motion's own body. `up`:
-    the vertical axis of the world of `own`. Raises InputError if the motion lacks a joint.
+    the vertical axis of the world of `own`. Raises InputError, naming `source`, if the motion lacks a joint.
     """
     other, names = motion.body, motion.body.rig.joint_names
     theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
@@ -104,7 +104,7 @@ def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
         if name in names:  # fingers, too, which are not free, but fitted
             theta[:, j] = other.theta[:, names.index(name)]
         elif own.rig.free[j]:
-            raise InputError(f"motion: has no joint {name}; use one that was fitted with this body model")
+            raise InputError(f"{source}: has no joint {name}; use a motion that was fitted with this body model")
     turn = torch.eye(4)
     turn[:3, :3] = _rotation_between_up_axes(motion.up, up)
     placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)

@@ -92,7 +92,7 @@ def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
         motion = Motion(select_poses(own, select_frames(own.frames, options.frames, subject)), capture.fps, capture.up)
     else:
         motion = read_motion(options.motion, options.frames)
-        motion = dataclasses.replace(motion, body=retarget(own, motion, capture.up), up=capture.up)
+        motion = dataclasses.replace(motion, body=retarget(own, motion, capture.up, options.motion), up=capture.up)
     body = motion.body
     fps = motion.fps / median_step(body.frames)
     if options.between is not None:

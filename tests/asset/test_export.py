@@ -156,7 +156,7 @@ def test_a_motion_that_lacks_a_joint_is_refused_before_anything_is_made(
     body = bending_body()
     names = tuple(f"other {name}" for name in body.rig.joint_names)
     strange = Motion(dataclasses.replace(body, rig=dataclasses.replace(body.rig, joint_names=names)), 25.0, "z")
-    with pytest.raises(InputError, match="has no joint"):
+    with pytest.raises(InputError, match="motion nod: has no joint"):
         export_asset(capture(), Masks({}, {}), StandInAvatar(body), SMALL, tmp_path, "", {"nod": strange})
 
 
