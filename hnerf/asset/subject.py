@@ -36,10 +36,11 @@ def export_subject(
 
 
 def _named(motions: Iterable[Path]) -> dict[str, Motion]:
-    """Read motions; each is called as its file, with underscores for what a name cannot have."""
+    """Read motions; each is called as its file or folder, with underscores for what a name cannot have."""
     found: dict[str, Motion] = {}
     for path in motions:
-        name = re.sub(r"\W+", "_", path.resolve().stem, flags=re.ASCII).strip("_")
+        called = path.resolve().name if path.is_dir() else path.stem  # a subject's name may have dots
+        name = re.sub(r"\W+", "_", called, flags=re.ASCII).strip("_")
         if not name or name in found or name.startswith(CAPTURED):
             raise InputError(f"{path}: a motion cannot be called {name!r} here, or another is; rename the file")
         found[name] = read_motion(path)

@@ -34,9 +34,12 @@ def test_motions_are_named_after_their_files(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(exported.Masks, "load", lambda folder: "masks")
     monkeypatch.setattr(exported, "avatar_of", lambda subject: "avatar")
     monkeypatch.setattr(exported, "export_asset", lambda *arguments: given.extend(arguments) or {"frames": 4})
-    motions = [tmp_path / "01 slow-walk.bvh", tmp_path / "ben"]
+    motions = [tmp_path / "01 slow-walk.bvh", tmp_path / "ben", tmp_path / "take.001", tmp_path / "take.002"]
+    for folder in motions[2:]:
+        folder.mkdir()
     assert export_subject(made(tmp_path / "ada"), AssetSettings(), motions, tmp_path / "out", "01ab") == {"frames": 4}
-    assert given[0] == "capture" and given[1] == "masks" and given[5:] == ["01ab", {"01_slow_walk": read, "ben": read}]
+    assert given[0] == "capture" and given[1] == "masks" and given[5] == "01ab"
+    assert given[6] == dict.fromkeys(("01_slow_walk", "ben", "take_001", "take_002"), read)
     assert (tmp_path / "out").is_dir()
 
 
