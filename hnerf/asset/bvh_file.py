@@ -23,6 +23,7 @@ def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
     local, offsets = turned.copy(), CENTIMETRES * skeleton.positions_m[1:]
     local[:, 1:] = turned[:, parents[1:]].swapaxes(2, 3) @ turned[:, 1:]
     offsets[1:] -= CENTIMETRES * skeleton.positions_m[1:][parents[1:]]
+    offsets[0] = 0  # some programs add the root's offset to its channels, others replace it by them
     positions = np.tile(offsets, (len(stage), 1, 1))
     positions[:, 0] = CENTIMETRES * stage[:, 0, :3, 3]
     names = tuple((name in EQUIVALENTS and EQUIVALENTS[name].mixamo) or name for name in skeleton.names[1:])
