@@ -290,14 +290,14 @@ class EvaluationSettings(Section):
 class AssetSettings(Section):
     """Settings of the exported assets."""
 
-    grid_cells: int = Field(default=256, ge=16)  # of marching cubes, along the longest side
+    grid_cells: int = Field(default=256, ge=16, le=1024)  # of marching cubes, along the longest side
     topology: Literal["registered", "captured", "both"] = "registered"  # body model's mesh, marching cubes', both
     faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered mesh has the body model's
     level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # most triangles of each lower level of detail
     texture_px: int = Field(default=1024, ge=16, le=8192)  # side of the texture
     texture_poses: int = Field(default=3, ge=1)  # poses whose median gives the field's colour of a texel
     photograph_frames: int = Field(default=16, ge=0)  # frames whose photographs make the texture; 0: the field alone
-    normal_map_px: int = Field(default=0, ge=0)  # side of the normal map; 0: none, since it shows grid cells
+    normal_map_px: int = Field(default=0, ge=0, le=8192)  # side of the normal map; 0: none, since it shows grid cells
     correctives: int = Field(default=16, ge=0, le=64)  # blend shapes for what skinning leaves out; 0: none
     bones: Literal["along", "identity"] = "along"  # joint axes at rest: Y along the bone, or the stage's
     splats: int = Field(default=0, ge=0, le=1_000_000)  # number of Gaussian splats; 0: no splat files

@@ -19,7 +19,7 @@ from tasks.store import Artifact
 from tasks.training import load_trained_avatar
 
 
-@stage("evaluation", version="18", networks=(LPIPS_ALEXNET,))
+@stage("evaluation", version="19", networks=(LPIPS_ALEXNET,))
 def evaluate(
     out: Path,
     truth: Source,

@@ -52,15 +52,14 @@ def compare_with_field(
 ) -> list[Compared]:
     """Return at most IMAGES views of training frames, from test cameras if the recording has masks of these, else from
     training cameras. None if no view has a mask."""
-    tested = sample_views(all_views(capture, NOVEL_VIEW), IMAGES)
+    tested = [view for view in all_views(capture, NOVEL_VIEW) if capture.has_given_mask(view.camera, view.frame)]
     trained = [view for view in all_views(capture, TRAINING_VIEW) if (view.camera, view.frame) in masks]
-    with_mask = [view for view in tested if _mask(capture, masks, view) is not None]
-    chosen = with_mask or sample_views(trained, IMAGES)
+    chosen = sample_views(tested or trained, IMAGES)
     surfaces = _skinned_surfaces(staged, [view.frame for view in chosen])
 
     def compare(view: View) -> Compared | None:
         mask = _mask(capture, masks, view)
-        if mask is None or not mask.any():
+        if not mask.any():
             return None
         return _compared(capture, view, mask, avatar, staged, surfaces[view.frame], splats)
 
@@ -116,12 +115,14 @@ def require_close(name: str, topology: str, figures: dict[str, Any], allow_poor:
         )
 
 
-def _mask(capture: Capture, masks: Masks, view: View) -> np.ndarray | None:
-    """Return a view's mask (H, W) bool: of training cameras the segmentation's, of test cameras the recording's own;
-    None where there is none."""
-    if view.split == NOVEL_VIEW:
-        return capture.given_mask(view.camera, view.frame)
-    return masks.get(view.camera, view.frame) if (view.camera, view.frame) in masks else None
+def _mask(capture: Capture, masks: Masks, view: View) -> np.ndarray:
+    """Return a view's mask (H, W) bool: of training cameras the segmentation's, of test cameras the recording's
+    own."""
+    if view.split != NOVEL_VIEW:
+        return masks.get(view.camera, view.frame)
+    given = capture.given_mask(view.camera, view.frame)
+    assert given is not None  # views without were left out
+    return given
 
 
 def _skinned_surfaces(staged: StagedAvatar, frames: list[int]) -> dict[int, Surface]:

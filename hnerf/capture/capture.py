@@ -85,6 +85,10 @@ class Capture:
         found = list((self.root / "background").glob(f"{camera}.*"))
         return read_rgb(found[0]) if found else None
 
+    def has_given_mask(self, camera: str, frame: int) -> bool:
+        """Return whether there is a given mask of a frame."""
+        return self._grey_path("masks", camera, frame).exists()
+
     def given_mask(self, camera: str, frame: int) -> np.ndarray | None:
         """Read the given mask recorded nearest in time to a frame, (H, W) bool, True on the person; None where there is
         none."""
@@ -98,11 +102,14 @@ class Capture:
         return None if likely is None else likely.astype(np.float32) / 255
 
     def _grey(self, folder: str, camera: str, frame: int, advice: str) -> np.ndarray | None:
-        path = self.root / folder / camera / f"{self.recorded_frame(camera, frame):06d}.png"
+        path = self._grey_path(folder, camera, frame)
         grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.exists() else None
         if grey is None and path.exists():
             raise InputError(f"{path}: not a readable image; {advice}")
         return grey
+
+    def _grey_path(self, folder: str, camera: str, frame: int) -> Path:
+        return self.root / folder / camera / f"{self.recorded_frame(camera, frame):06d}.png"
 
     def keypoints(self, camera: str) -> np.ndarray | None:
         """Return BODY_25 keypoints (frames, people, 25, 3) x_px, y_px, confidence in the order of `frames`; all 0 where

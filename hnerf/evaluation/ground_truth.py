@@ -34,8 +34,8 @@ class GroundTruth:
 
     @property
     def has_masks(self) -> bool:
-        """Return whether there are true masks."""
-        return self._path("masks").is_dir()
+        """Return whether any test camera has masks."""
+        return any(self.has_mask(c, f) for c in self.capture.test_cameras for f in self.capture.frames)
 
     def has_mask(self, camera: str, frame: int) -> bool:
         """Return whether this image has a true mask: there may be a few drawn by hand."""
@@ -107,10 +107,9 @@ class GivenMasks(GroundTruth):
     """The Truth of captures whose test cameras have no true masks but some that came with the recording: photographs
     under these, with everybody whom they show. Surfaces are still those of `ground_truth/`."""
 
-    @property
-    def has_masks(self) -> bool:
-        """Return whether any test camera has masks."""
-        return any(self.has_mask(c, f) for c in self.capture.test_cameras for f in self.capture.frames)
+    def has_mask(self, camera: str, frame: int) -> bool:
+        """Return whether a mask of this image came with the recording."""
+        return self.capture.has_given_mask(camera, frame)
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """Return the given mask, (H, W) bool, True on the person."""
@@ -122,12 +121,10 @@ class GivenMasks(GroundTruth):
         """Return the photograph under its mask, (H, W, 3) uint8, and the name of that source."""
         return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], GIVEN_MASKED_IMAGE
 
-    def _mask_path(self, camera: str, frame: int) -> Path:
-        return self.capture.root / "masks" / camera / f"{self.capture.recorded_frame(camera, frame):06d}.png"
-
 
 def truth_of(folder: Path, capture: Capture) -> GroundTruth:
-    """Return what a capture with an original folder is scored against: GivenMasks only if there are no true masks."""
+    """Return what a capture with an original folder is scored against: GivenMasks only if its test cameras have no true
+    masks."""
     truth, given = GroundTruth(folder, capture), GivenMasks(folder, capture)
     return given if not truth.has_masks and given.has_masks else truth
 

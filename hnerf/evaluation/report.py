@@ -267,7 +267,7 @@ def costs(stages: dict[str, dict[str, Any]], found: Metrics) -> list[tuple[str, 
         seconds = report.get("seconds", {})
         parts = {f"{name}: {part}": s for part, s in seconds.items()} if isinstance(seconds, dict) else {name: seconds}
         rows += [(f"{part}, seconds", readable(s)) for part, s in parts.items()]
-    rows.append(("One image, seconds (mean)", readable(found["seconds_per_image"])))
+    rows.append(("Rendering, seconds per image", readable(found["seconds_per_image"])))
     training = stages["Training"]
     sizes = ("device", "processes", "steps", "peak_memory_gib", "parameters", "model_mib")
     return rows + [(key.replace("_", " ").capitalize(), readable(training[key])) for key in sizes if key in training]
@@ -325,7 +325,7 @@ def readable(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
     if isinstance(value, list | tuple):
         flat = list(_leaves(value))
         if len(flat) > LONG_LIST and all(isinstance(v, int | float) for v in flat):

@@ -155,6 +155,17 @@ def test_test_cameras_with_masks_come_first(recorded: Capture, staged: StagedAva
     assert comparison_figures(found)["cameras"] == "test"
 
 
+def test_views_are_drawn_from_those_with_a_mask(recorded: Capture, staged: StagedAvatar) -> None:
+    """Of three test cameras, only the last has masks."""
+    further = {name: dataclasses.replace(side_camera(), name=name) for name in ("02", "03", "04")}
+    tested = dataclasses.replace(recorded, cameras=recorded.cameras | further, test_cameras=tuple(further))
+    for frame in recorded.train_frames:
+        write_image(tested.root / f"images/04/{frame:06d}.png", np.full((480, 640, 3), 9, np.uint8))
+        write_image(tested.root / f"masks/04/{frame:06d}.png", np.where(square(), 255, 0).astype(np.uint8))
+    found = compare_with_field(tested, masks_of(recorded.train_frames), GreyField(bending_body()), staged)
+    assert [(c.view.camera, c.view.frame) for c in found] == [("04", frame) for frame in recorded.train_frames]
+
+
 def test_without_a_mask_there_is_a_reason_and_no_refusal(recorded: Capture, staged: StagedAvatar) -> None:
     nobody = Masks({("01", 3): encode(np.zeros((480, 640), bool))}, {})
     for masks in (nobody, Masks({}, {})):

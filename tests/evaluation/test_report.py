@@ -23,6 +23,7 @@ def test_readable_values() -> None:
         "none",
         "a, 1",
     ]
+    assert [readable(v) for v in (9999.4, 12345.6)] == ["9999", "12346"]
     assert readable([[0.5, 2.0, 1.0]] * 5) == "15 values from 0.5 to 2"
 
 
@@ -57,7 +58,7 @@ def test_costs_have_a_row_a_part_of_a_stage() -> None:
         ("Body fit: outlines, seconds", "12.25"),
         ("Training, seconds", "60"),
         ("Evaluation: rendering, seconds", "3.5"),
-        ("One image, seconds (mean)", "0.1"),
+        ("Rendering, seconds per image", "0.1"),
     ]
 
 

@@ -102,8 +102,9 @@ function connectMotion(viewer) {
 }
 
 function showTime({ avatar, recording }) {
-  const frame = recording.first_frame + Math.round(avatar.time * recording.fps);
-  const text = avatar.duration ? `frame ${frame} · ${avatar.time.toFixed(2)} s` : "at rest";
+  const recorded = avatar.motion === avatar.motions[0]; // others have no frames of the recording
+  const frame = recorded ? `frame ${recording.first_frame + Math.round(avatar.time * recording.fps)} · ` : "";
+  const text = avatar.duration ? `${frame}${avatar.time.toFixed(2)} s` : "at rest";
   find("time").value = avatar.time;
   find("time").setAttribute("aria-valuetext", text);
   find("clock").textContent = text;
