@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 import numpy as np
-from provenance import SHARED, provenance, provenance_line, table, write_result
+from provenance import SHARED, arguments, provenance, provenance_line, table, write_result
 
 from hnerf.calibration.boards.calibrate import calibrate_from_boards, rms
 from hnerf.calibration.boards.rig import compare_pairs, solve_boards, solve_rig
@@ -31,6 +31,7 @@ GOALS = {"found_share": 0.8, "turned_deg": 2.0, "moved_cm": 3.0, "rms_px": 0.5}
 
 def main() -> None:
     """Calibrate, compare, print and write."""
+    arguments(__doc__).parse_args()
     where, folder = provenance(), SHARED / "data" / FOOTAGE
     started = time.perf_counter()
     calibration = calibrate_from_boards(folder)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from provenance import provenance, provenance_line, table, write_result
+from provenance import arguments, provenance, provenance_line, table, write_result
 from torch import Tensor
 
 from hnerf.body.anny import anny_rig
@@ -26,6 +26,7 @@ RUNS = 5
 
 def main() -> None:
     """Measure, print and write."""
+    arguments(__doc__).parse_args()
     where, rows = provenance(), measure()
     result = where | {"points": POINTS, "frames": FRAMES, "points_per_s": rows}
     shown = [["query", "points a second"], *([name, f"{rate:,.0f}"] for name, rate in rows.items())]

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from peak_memory import peak_mib
-from provenance import SHARED, log_progress, provenance, provenance_line, table, write_result
+from provenance import SHARED, arguments, log_progress, provenance, provenance_line, table, write_result
 
 from hnerf.capture.capture import PERSON, Capture, read_rgb
 from hnerf.capture.ingest import ingest
@@ -45,6 +45,7 @@ PROTOCOL = (
 
 def main() -> None:
     """Detect, measure, print and write."""
+    arguments(__doc__).parse_args()
     log_progress()
     result: dict[str, Any] = provenance() | {"protocol": PROTOCOL, "captures": {}}
     for name in (REAL, *RENDERED):

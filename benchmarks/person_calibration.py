@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from provenance import SHARED, log_progress, provenance, provenance_line, table, write_result
+from provenance import SHARED, arguments, log_progress, provenance, provenance_line, table, write_result
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.rig import pose_vertices
@@ -56,6 +56,7 @@ PROTOCOL = (
 
 def main() -> None:
     """Measure, print and write."""
+    arguments(__doc__).parse_args()
     log_progress()
     result: dict[str, Any] = provenance() | {"protocol": PROTOCOL, "captures": {}}
     for name in (REAL, *RENDERED):

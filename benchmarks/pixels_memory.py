@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.multiprocessing as multiprocessing
-from provenance import provenance, provenance_line, table, write_result
+from provenance import arguments, provenance, provenance_line, table, write_result
 
 from hnerf.capture.masks import Masks, encode
 from hnerf.training.distributed import Distributed
@@ -31,13 +31,14 @@ GIB = 2**30
 
 def main() -> None:
     """Measure, print and write."""
-    rows = {str(n): measure(n) for n in PROCESSES}
+    arguments(__doc__).parse_args()
+    where, rows = provenance(), {str(n): measure(n) for n in PROCESSES}
     size = f"{FRAMES} frames x {CAMERAS} cameras x {SIZE_PX} px"
     shown = [["processes", "all processes, GiB", "before pixels", "pixels", "peak while gathering"]]
     for n, row in rows.items():
         sizes = (row["all_gib"], row["before_gib"], row["all_gib"] - row["before_gib"], row["gathering_gib"])
         shown.append([n, *(f"{gib:.2f}" for gib in sizes)])
-    result = provenance() | {"size": size, "processes": rows}
+    result = where | {"size": size, "processes": rows}
     message = f"{size}; the last column is the gathering process's own memory, without the files that it writes."
     markdown = "\n".join(["# Host memory of pixels", "", provenance_line(result), "", message, "", *table(shown), ""])
     write_result("pixels-memory", result, markdown)
