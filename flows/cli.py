@@ -25,6 +25,7 @@ NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of l
 CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # of hnerf.capture.formats.export, which is slow
 PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # of hnerf.render.subject, which imports torch
 SIZES_PX = (2, 8000)  # of a picture's side, of the same module
+ORBIT_PICTURES = 60  # of the same module
 STATURE_M = (0.5, 2.3)  # of hnerf.calibration.diagnosis, which imports numpy
 MAX_COUNT, MAX_M = 999_999, 1000  # pictures have names of six digits
 FOLDERS = {
@@ -154,7 +155,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_calibrate(add(commands.calibrate))
     add(commands.synchronise).add_argument("folder", type=Path, help="capture whose cameras did not start together")
     cameras = add(commands.export_cameras)
-    cameras.add_argument("folder", type=Path, help="capture folder, or what `hnerf calibrate` wrote")
+    cameras.add_argument(
+        "folder", type=Path, help="capture folder, what `hnerf calibrate` wrote, or <store>/subjects/<name>/calibration"
+    )
     cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True, help="format to write")
     _add_out(cameras, "cameras")
 
@@ -313,7 +316,13 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     render.add_argument(
         "--size", **_number(int, *SIZES_PX, "PX", "longest side of an image (default: that of the capture)")
     )
-    render.add_argument("--pictures", **_number(int, 1, MAX_COUNT, "N", "number of images (default: one per pose)"))
+    render.add_argument(
+        "--pictures",
+        **_number(
+            int, 1, MAX_COUNT, "N",
+            f"number of images (default: one per pose; {ORBIT_PICTURES} for --between, and for one pose on an orbit)",
+        ),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

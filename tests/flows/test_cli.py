@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from flows.cli import CAMERA_FORMATS, PICTURES, SIZES_PX, STATURE_M, main
+from flows.cli import CAMERA_FORMATS, ORBIT_PICTURES, PICTURES, SIZES_PX, STATURE_M, main
 from flows.train_subject import Trained, train_subject
 from hnerf import synthetic
 from hnerf.calibration.diagnosis import BODY_HEIGHT_M
@@ -16,6 +16,7 @@ from hnerf.capture.formats.export import WRITERS
 from hnerf.config import AssetSettings, SyntheticSettings
 from hnerf.errors import InvalidAsset
 from hnerf.render.subject import MAX_SIZE_PX, MIN_SIZE_PX, OUTPUT_KINDS
+from hnerf.render.subject import ORBIT_PICTURES as PICTURES_OF_AN_ORBIT
 from tasks.bucket import BucketError
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
@@ -263,6 +264,7 @@ def test_choices_and_ranges_are_those_of_the_library() -> None:
     assert OUTPUT_KINDS == PICTURES
     assert (MIN_SIZE_PX, MAX_SIZE_PX) == SIZES_PX
     assert BODY_HEIGHT_M == STATURE_M
+    assert PICTURES_OF_AN_ORBIT == ORBIT_PICTURES
 
 
 @pytest.mark.parametrize(("flags", "allowed"), [([], False), (["--allow-poor"], True)])
