@@ -232,12 +232,12 @@ def render(options: argparse.Namespace) -> None:
 
 def export(options: argparse.Namespace) -> None:
     """Export the asset of a trained person again, with other settings or more motions."""
-    from hnerf.asset.subject import export_subject
-    from tasks.store import recording_digest, require_intact
-
     for override in options.overrides:
         if override.partition("=")[0].split(".")[0] != "asset":
             raise InputError(f"--set {override}: hnerf export takes settings of the section `asset` only; remove it")
+    from hnerf.asset.subject import export_subject
+    from tasks.store import recording_digest, require_intact
+
     for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
         require_intact(folder)
     allowed = ["asset.allow_poor=true"] if options.allow_poor else []

@@ -196,7 +196,8 @@ def test_help_and_refusals_do_without_what_takes_seconds_to_import() -> None:
 import sys
 from contextlib import suppress
 from flows.cli import main
-for arguments in (["--help"], ["run", "--help"], ["run", "absent"], ["run"], ["settings"]):
+other_section = ["export", ".", "--set", "training.steps=3"]
+for arguments in (["--help"], ["run", "--help"], ["run", "absent"], ["run"], ["settings"], other_section):
     with suppress(SystemExit):
         main(arguments)
     heavy = {"torch", "prefect", "warp", "cv2", "numpy", "scipy", "rich"} & set(sys.modules)
