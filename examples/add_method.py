@@ -1,12 +1,9 @@
 """Add a compared method: NeRF with a voxel grid in place of its two networks, trained by the trainer of all methods.
 
-usage: python examples/add_method.py SUBJECT OUT
+`subject` is what examples/train.py wrote; its first frame is trained on. For a method to keep, see CONTRIBUTING.md."""
 
-SUBJECT: what examples/train.py wrote; its first frame is trained on. For a method to keep, see CONTRIBUTING.md.
-"""
-
-import dataclasses
-import sys
+import argparse
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -40,11 +37,14 @@ class VoxelField(NerfField):
 
 def main(subject, out, overrides=()):
     capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
-    capture = dataclasses.replace(capture, train_frames=capture.train_frames[:1])
+    capture = replace(capture, train_frames=capture.train_frames[:1])
     masks, body = Masks.load(subject / "segmentation"), BodyFit.load(subject / "fit")
     with patch.object(trainer, "build_field", lambda settings, body, static: VoxelField(body)):
         return trainer.train(capture, masks, body, load_settings("nerf", overrides).training, out)
 
 
 if __name__ == "__main__":
-    print(main(Path(sys.argv[1]), Path(sys.argv[2])))
+    parser = argparse.ArgumentParser(description=__doc__)
+    for folder in ("subject", "out"):
+        parser.add_argument(folder, type=Path)
+    print(main(**vars(parser.parse_args())))

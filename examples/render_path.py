@@ -1,13 +1,11 @@
 """Render a trained person along a path of cameras: from one recorded camera through the others and back to the first.
 
-usage: python examples/render_path.py SUBJECT OUT
-
-SUBJECT is `store/subjects/NAME` of `hnerf run`, or the folder that `examples/train.py` wrote. Writes one RGBA PNG a
+`subject` is `store/subjects/NAME` of `hnerf run`, or the folder that `examples/train.py` wrote. Writes one RGBA PNG per
 picture: colour over black, and coverage.
 """
 
+import argparse
 import dataclasses
-import sys
 from pathlib import Path
 
 from hnerf.avatar.trained import load_avatar
@@ -32,4 +30,7 @@ def main(subject: Path, out: Path, pictures: int = 60, side_px: int = 256) -> No
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("subject", type=Path)
+    parser.add_argument("out", type=Path)
+    main(**vars(parser.parse_args()))

@@ -1,12 +1,10 @@
 """Train from Python: from a synthetic capture to a trained person, stage by stage, without Prefect or a store.
 
-usage: python examples/train.py OUT
-
-Leaves `OUT/performer`, the recording, and one folder a stage, named as in `store/subjects/NAME`, so that `hnerf render
-OUT` and the other examples can read them.
+Leaves `out/performer`, the recording, and one folder per stage, named as in `store/subjects/NAME`, so that `hnerf
+render out` and the other examples can read them.
 """
 
-import sys
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -39,4 +37,6 @@ def main(out: Path, performer: SyntheticSettings, overrides: Sequence[str] = ())
 
 
 if __name__ == "__main__":
-    print(f"trained in {main(Path(sys.argv[1]), SyntheticSettings()):.0f} s")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    print(f"trained in {main(parser.parse_args().out, SyntheticSettings()):.0f} s")

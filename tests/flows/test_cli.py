@@ -27,7 +27,7 @@ from tests.shared_data import shared_capture
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["run", "absent"], "absent: no such folder"),
+        (["run", "absent"], "absent: no such folder or video; give the capture folder, or one video"),
         (["check-cameras", "absent"], "absent: no such folder"),
         (["stability", "absent"], "absent: no such folder"),
         (["render", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
