@@ -21,8 +21,8 @@ log = logging.getLogger("hnerf.calibration")
 
 
 class Clocks(NamedTuple):
-    """Clocks by camera, the first camera's being the common one. error_s: standard error of each offset; pairs: what
-    was measured; refused: why a pair was not."""
+    """Clocks by camera, the first camera's being the common one. error_s: standard error of each, in the middle of what
+    it recorded together with others; pairs: what was measured; refused: why a pair was not."""
 
     clocks: dict[str, Clock]
     error_s: dict[str, float]
@@ -61,13 +61,15 @@ def estimate_clocks(
     _check_linked(names, pairs, refused)
     rates, _ = _solve(names, {pair: np.log(found.rate) for pair, found in pairs.items()},
                       {pair: max(found.rate_error, 1e-7) for pair, found in pairs.items()}, {})  # fmt: skip
+    rate_of = dict(zip(names, np.exp(rates), strict=True))
+    ratios = {(a, b): float(rate_of[b] / rate_of[a]) for a, b in pairs}
     offsets_s, errors_s = _solve(
         names,
-        {pair: found.offset_s for pair, found in pairs.items()},
+        {pair: found.offset_at(ratios[pair]) for pair, found in pairs.items()},
         {pair: max(found.error_s, LEAST_ERROR_S) for pair, found in pairs.items()},
-        {pair: found.rate for pair, found in pairs.items()},
+        ratios,
     )
-    clocks = {name: Clock(float(o), float(np.exp(r))) for name, o, r in zip(names, offsets_s, rates, strict=True)}
+    clocks = {name: Clock(float(o), float(rate_of[name])) for name, o in zip(names, offsets_s, strict=True)}
     return Clocks(clocks, dict(zip(names, map(float, errors_s), strict=True)), pairs, refused)
 
 

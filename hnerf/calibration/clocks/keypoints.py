@@ -36,15 +36,21 @@ class Track(NamedTuple):
 
 
 class PairClock(NamedTuple):
-    """The clock of camera b by that of camera a: t_b = rate t_a + offset_s. error_s: standard error of the offset in
-    the middle of what both recorded; rate_error: of the rate, at most MAX_DRIFT_ERROR; clear: the residual as a share
-    of that of the next best offset."""
+    """The clock of camera b by that of camera a: t_b = rate t_a + offset_s. middle_s: the middle of what both recorded,
+    by a's clock; error_s: standard error of t_b there; rate_error: of the rate, at most MAX_DRIFT_ERROR; clear: the
+    residual as a share of that of the next best offset."""
 
     offset_s: float
     rate: float
+    middle_s: float
     error_s: float
     rate_error: float
     clear: float
+
+    def offset_at(self, rate: float) -> float:
+        """Return the offset that puts both clocks in step in the middle of what both recorded, should b's rate be
+        another: other pairs may tell it better."""
+        return self.offset_s + (self.rate - rate) * self.middle_s
 
 
 class _Path(NamedTuple):
@@ -79,10 +85,12 @@ class _Path(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """A refined clock. covariance (2, 2): of the offset in the middle of what both recorded, and of the rate."""
+    """A refined clock. middle_s: the middle of what both recorded, by the first clock; covariance (2, 2): of the offset
+    there, and of the rate."""
 
     offset_s: float
     rate: float
+    middle_s: float
     residual: float
     covariance: np.ndarray
 
@@ -141,9 +149,9 @@ def pair_clock(a: _Path, b: _Path, fundamental: np.ndarray | None = None, near_s
     drifting = _refined(a, b, best.offset_s, f, drifts=True)
     error = np.sqrt(drifting.covariance.diagonal())
     if error[1] < MAX_DRIFT_ERROR and abs(drifting.rate - 1) > DRIFT_SIGMAS * error[1]:
-        return PairClock(drifting.offset_s, drifting.rate, float(error[0]), float(error[1]), clear)
+        return PairClock(*drifting[:3], float(error[0]), float(error[1]), clear)
     rate_error = min(float(error[1]), MAX_DRIFT_ERROR)  # unknown is not none: other pairs may tell
-    return PairClock(best.offset_s, 1.0, float(np.sqrt(best.covariance[0, 0])), rate_error, clear)
+    return PairClock(*best[:3], float(np.sqrt(best.covariance[0, 0])), rate_error, clear)
 
 
 def _unit_fundamental(fundamental: np.ndarray, a: _Path, b: _Path) -> np.ndarray:
@@ -217,7 +225,7 @@ def _refined(a: _Path, b: _Path, offset_s: float, fixed: np.ndarray | None, drif
         x_b, v_b, known = b.at(times_s + clock[0] + clock[1] * (times_s - middle_s))
         known = known & known_a
         if known.sum() < MIN_KEYPOINTS:
-            return _Fit(offset_s, 1.0, np.inf, np.full((2, 2), np.inf))
+            return _Fit(offset_s, 1.0, middle_s, np.inf, np.full((2, 2), np.inf))
         in_a, in_b = (np.column_stack([x[known], np.ones(known.sum())]) for x in (places, x_b))
         t = np.broadcast_to(times_s[:, None] - middle_s, known.shape)[known]
         A = (in_b[:, :, None] * in_a[:, None, :]).reshape(-1, 9)
@@ -243,7 +251,7 @@ def _refined(a: _Path, b: _Path, offset_s: float, fixed: np.ndarray | None, drif
     covariance = np.zeros((2, 2))
     covariance[: 1 + drifts, : 1 + drifts] = variance * np.linalg.pinv(normal)[: 1 + drifts, : 1 + drifts]
     residual = float(np.quantile(np.abs(residuals), JUDGED))
-    return _Fit(float(clock[0] - clock[1] * middle_s), float(1 + clock[1]), residual, covariance)
+    return _Fit(float(clock[0] - clock[1] * middle_s), float(1 + clock[1]), middle_s, residual, covariance)
 
 
 def _off_together(a: _Path, b: _Path, frames: int) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.clocks.estimate import _solve, estimate_clocks
-from hnerf.calibration.clocks.keypoints import Track, _off_together, pair_clock, smoothed
+from hnerf.calibration.clocks.keypoints import PairClock, Track, _off_together, pair_clock, smoothed
 from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.calibration.matches import fundamental
 from hnerf.errors import InputError
@@ -84,6 +84,23 @@ def test_a_drift_that_two_cameras_show_outlasts_a_third_that_tells_none(monkeypa
     found = estimate_clocks({name: name for name in "abc"})
     assert 1e6 * (found.clocks["b"].rate - 1) == pytest.approx(398, abs=1)
     assert 1e6 * (found.clocks["c"].rate - 1) == pytest.approx(199, abs=1)
+
+
+def test_a_short_recording_is_in_step_where_it_was_made_though_the_rate_of_its_clock_is_a_guess(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """b drifts by 100 ppm against a; c recorded 20 s of both, around 570 s by a's clock, when b's showed 570.057 s and
+    its own 10 s. Whatever rate c is given, it must show 10 s at 570 s."""
+    pairs = {
+        "ab": PairClock(0.0, 1 + 1e-4, 300.0, 5e-4, 2e-6, 0.2),
+        "ac": PairClock(-560.0, 1.0, 570.0, 1e-3, 1e-4, 0.2),
+        "bc": PairClock(-560.057, 1.0, 570.057, 1e-3, 1e-4, 0.2),
+    }
+    monkeypatch.setattr("hnerf.calibration.clocks.estimate.smoothed", lambda track: track)
+    monkeypatch.setattr("hnerf.calibration.clocks.estimate.pair_clock", lambda a, b, *_: pairs[a + b])
+    found = estimate_clocks({name: name for name in "abc"}).clocks
+    assert 570 * found["b"].rate + found["b"].offset_s == pytest.approx(570.057, abs=1e-4)
+    assert 570 * found["c"].rate + found["c"].offset_s == pytest.approx(10, abs=1e-4)
 
 
 def test_a_drift_of_200_ppm_in_five_minutes() -> None:
