@@ -68,7 +68,7 @@ class BoardCalibration:
 def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> BoardCalibration:
     """Calibrate the cameras from the board footage in a folder's `calibration/`.
 
-    Intrinsics come from calibration/intrinsic/, else from the folder's calibration files, else from
+    Intrinsics come from calibration/intrinsic/ where it fixes them, else from the folder's calibration files, else from
     calibration/extrinsic/ itself. The world is the first camera, or the board as it lies in frame `ground_frame` (Z up,
     origin at its top left corner). Raises InputError if the footage lacks what is needed.
     """
@@ -164,10 +164,10 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
     for name, size_px in footage.sizes_px.items():
         source = close if close is not None and name in close.corners_px else footage
         found = estimate_lens(name, source.board.corners_m, source.corners_px[name], source.sizes_px[name])
-        if source is footage and name in given:
-            lenses[name], words[name] = given[name], f"given; {_compared(found, given[name])}"
-        elif found.reliable_lens:
+        if found.reliable_lens and (source is close or name not in given):
             lenses[name], words[name] = found.reliable_lens, f"from {source.path.name}/: {found.certainty}"
+        elif name in given:
+            lenses[name], words[name] = given[name], f"given; {_compared(found, given[name])}"
         else:
             raise InputError(
                 f"{source.path / name}: does not fix the intrinsics ({found.certainty}); film the board closer, "

@@ -195,6 +195,14 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
     read["intrinsic"] = footage("intrinsic", close_up(0.7)[:9])
     with pytest.raises(InputError, match="intrinsic/a: does not fix the intrinsics"):
         calibrate_from_boards(tmp_path)
+    given = Lens("a", np.array([[901.0, 0, 640], [0, 901, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0]), np.eye(3),
+                 np.zeros(3), (1280, 720))  # fmt: skip
+    write_cameras(tmp_path, [given], "easymocap")
+    calibration = calibrate_from_boards(tmp_path)
+    assert calibration.lenses["a"].K[0, 0] == 901
+    assert calibration.intrinsics["a"].startswith("given; not verified by the footage (9 pictures")
+    read["intrinsic"] = footage("intrinsic", close_up(0.7))
+    assert calibrate_from_boards(tmp_path).intrinsics["a"].startswith("from intrinsic/: 20 pictures")
 
 
 def test_given_intrinsics_without_a_size_have_that_of_the_footage(
