@@ -207,7 +207,8 @@ def _timing_reason(offset_frames: float, left: Timing) -> str:
     """Return, in words, what is known about a camera's time offset: as corrected, and as measured after the
     correction."""
     if offset_frames:
-        return f"out of step by {offset_frames:+.2f} +- {left.error_frames:.2f} frames: corrected"
+        error = "" if np.isnan(left.error_frames) else f" +- {left.error_frames:.2f}"
+        return f"out of step by {offset_frames:+.2f}{error} frames: corrected"
     if left.reason:
         return f"offset in time not observable: {left.reason}"
     return f"in step: measured offset {left.offset_frames:+.2f} +- {left.error_frames:.2f} frames"

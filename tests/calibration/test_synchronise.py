@@ -104,6 +104,14 @@ def test_the_report_corrects_and_says_so(tmp_path: Path, no_pictures: None) -> N
     assert np.abs(found[5] - given[7]).max() < 2
 
 
+def test_an_offset_whose_error_is_not_known_is_told_without_one(tmp_path: Path, no_pictures: None) -> None:
+    """Of twelve frames nine are left, too few to measure what remains."""
+    report = check_calibration(capture_of(tmp_path, recorded({"c2": 3.0}, frames=12, speed=2)), SETTINGS)
+    assert np.isnan(report.verdicts["c2"].timing.error_frames)
+    told = next(reason for reason in report.verdicts["c2"].reasons if reason.startswith("out of step"))
+    assert told == f"out of step by {report.verdicts['c2'].frame_offset:+.2f} frames: corrected"
+
+
 def test_strided_frames_say_what_to_cut(tmp_path: Path, no_pictures: None) -> None:
     strided = recorded({"c0": -2.0, "c1": 0.0}, frames=4 * FRAMES)[:, ::4]
     capture = capture_of(tmp_path, strided, frames=tuple(range(0, 4 * FRAMES, 4)))
