@@ -1,6 +1,6 @@
 """Contact sheet of the evidence: keypoints, outlines and matches of each camera under the cameras used."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.evidence import NO_MATCHES, Evidence
+from hnerf.calibration.silhouettes import MaskOutline
 from hnerf.capture.keypoint_sets import FEET, LIMBS
 from hnerf.geometry.camera import Camera
 
@@ -24,7 +25,10 @@ PANEL_INCHES = 4.2
 def draw_evidence(path: Path, evidence: Evidence, cameras: Sequence[Camera], found: Measure) -> None:
     """Write the sheet as PNG, one row per camera. found: what `measure` returns for these cameras."""
     capture, outlines = evidence.capture, evidence.outlines
-    instant = outlines.instants[len(outlines.instants) // 2] if outlines else len(capture.frames) // 2
+    middle = len(outlines.instants) // 2 if outlines else 0
+    instant = outlines.instants[middle] if outlines else len(capture.frames) // 2
+    every_px = outlines.residuals_px(cameras) if outlines else {}
+    shown_px = outlines.some(slice(middle, middle + 1)).residuals_px(cameras) if outlines else {}
     figure = Figure(figsize=(3 * PANEL_INCHES + 1, PANEL_INCHES * len(cameras) + 0.6), layout="constrained")
     panels = figure.subplots(len(cameras), 3, squeeze=False)
     for row, camera, detected in zip(panels, cameras, evidence.keypoints[:, instant], strict=True):
@@ -32,7 +36,8 @@ def draw_evidence(path: Path, evidence: Evidence, cameras: Sequence[Camera], fou
             axes.imshow((BRIGHTNESS * capture.image(camera.name, frame)).astype(np.uint8))
             axes.set_axis_off()
         marks = _draw_keypoints(row[0], camera, detected, found.points_m[instant])
-        _draw_outline(row[1], cameras, camera, evidence)
+        outline = outlines.by_camera[camera.name][middle] if outlines and camera.name in every_px else None
+        _draw_outline(row[1], camera.name, outline, every_px, shown_px)
         _draw_matches(row[2], cameras, camera, evidence)
         message = f"{camera.name}: keypoints, median {found.median_px[camera.name]:.1f} px"
         row[0].set_title(f"{message}, 95 % below {found.p95_px[camera.name]:.1f} px", fontsize=10)
@@ -52,22 +57,22 @@ def _draw_keypoints(axes: Axes, camera: Camera, detected: np.ndarray, points_m: 
     return _scatter(axes, detected[seen, :2], np.linalg.norm(uv[seen] - detected[seen, :2], axis=-1), 26)
 
 
-def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidence: Evidence) -> None:
-    """Draw points of the outline, coloured by how far their rays miss the visual hull of the other cameras."""
-    axes.set_title(f"{camera.name}: no outline", fontsize=10)
-    outlines = evidence.outlines
-    if outlines is None or camera.name not in outlines.by_camera:
+def _draw_outline(
+    axes: Axes,
+    name: str,
+    outline: MaskOutline | None,
+    every_px: Mapping[str, np.ndarray],
+    shown_px: Mapping[str, np.ndarray],
+) -> None:
+    """Draw points of the outline, coloured by how far their rays miss the visual hull of the other cameras, `shown_px`,
+    which is empty if no other camera has an outline then. every_px: of the outlines of all instants."""
+    if outline is None or len(shown_px[name]) == 0:
+        axes.set_title(f"{name}: no outline", fontsize=10)
         return
-    middle = len(outlines.instants) // 2
-    outline = outlines.by_camera[camera.name][middle]
-    if outline is None:
-        return
-    residuals_px = outlines.residuals_px(cameras)[camera.name]
-    if len(residuals_px) == 0:  # no other camera has one at the same instants
-        return
+    residuals_px = every_px[name]
     message = f"mean {residuals_px.mean():.2f} px, 95 % below {np.percentile(residuals_px, 95):.1f} px"
-    axes.set_title(f"{camera.name}: outline, {message}", fontsize=10)
-    _scatter(axes, outline.points_px, outlines.some(slice(middle, middle + 1)).residuals_px(cameras)[camera.name], 14)
+    axes.set_title(f"{name}: outline, {message}", fontsize=10)
+    _scatter(axes, outline.points_px, shown_px[name], 14)
 
 
 def _draw_matches(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidence: Evidence) -> None:

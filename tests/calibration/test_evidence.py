@@ -13,8 +13,8 @@ from hnerf.calibration.diagnosis import measure
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.report import load_cameras
-from hnerf.calibration.sheet import draw_evidence
-from hnerf.calibration.silhouettes import Outlines
+from hnerf.calibration.sheet import _scatter, draw_evidence
+from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CalibrationSettings
@@ -58,6 +58,25 @@ def test_matches_of_a_pair_speak_for_both_cameras(wave: Capture, tmp_path: Path)
     assert said["silhouettes"] == {"01": {"rays": 0}, "02": {"rays": 0}}
     draw_evidence(tmp_path / "sheet.png", evidence, cameras, measure(cameras, keypoints))
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
+
+
+def test_the_sheet_asks_once_for_outlines_and_draws_none_that_has_no_other(
+    wave: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the middle of the instants, which is shown, only one camera has an outline: nothing says how far it is off."""
+    cameras = [wave.cameras[name] for name in wave.train_cameras]
+    keypoints = np.stack([subject_keypoints(wave)[name] for name in wave.train_cameras])
+    disc = np.zeros(cameras[0].size_px[::-1], np.uint8)
+    outline = MaskOutline.around(cv2.circle(disc, (disc.shape[1] // 2, disc.shape[0] // 2), 40, 1, cv2.FILLED) > 0)
+    outlines = Outlines({"01": [outline, outline], "02": [outline, None]}, (0, 1))
+    evidence = Evidence(wave, keypoints, outlines, Matches({}, wave.frames[0]), None)
+    drawn, asked = [], []
+    residuals_px = Outlines.residuals_px
+    monkeypatch.setattr(Outlines, "residuals_px", lambda *given: asked.append(given) or residuals_px(*given))
+    monkeypatch.setattr("hnerf.calibration.sheet._scatter", lambda *given: drawn.append(given) or _scatter(*given))
+    draw_evidence(tmp_path / "sheet.png", evidence, cameras, measure(cameras, keypoints))
+    assert len(drawn) == len(cameras)  # keypoints alone
+    assert len(asked) == 2
 
 
 def test_without_masks_the_report_says_so(wave: Capture) -> None:
