@@ -133,15 +133,21 @@ def pair_clock(a: _Path, b: _Path, fundamental: np.ndarray | None = None, near_s
 
     fundamental: F (3, 3) with x_b^T F x_a = 0 in pixels, where the cameras are calibrated; it is found with the offset
     otherwise. near_s: an offset that is known to half a second, from the sound. Raises InputError where the recordings
-    do not share enough, or no offset is clearly better than all others.
+    do not share enough keypoints, or no offset is clearly better than all others.
     """
     f = None if fundamental is None else _unit_fundamental(fundamental, a, b)
     offsets_s = _best_offsets(a, b, f) if near_s is None else np.array([near_s])
     fits = [_refined(a, b, offset, f, drifts=False) for offset in offsets_s]
     best = min(fits, key=lambda fit: fit.residual)
+    if not np.isfinite(best.residual):
+        where = "" if near_s is None else f" {near_s:+.1f} s apart, as their sound has them,"
+        raise InputError(
+            f"the recordings{where} share fewer than {MIN_KEYPOINTS} keypoints of the person; film longer, with the "
+            "person in view of both, or leave one out"
+        )
     others = [fit.residual for fit in fits if abs(fit.offset_s - best.offset_s) > OTHER_S]
     clear = best.residual / min(others) if others else 0.0
-    if not np.isfinite(best.residual) or clear > CLEAR:
+    if clear > CLEAR:
         raise InputError(
             "no start offset is clearly better than all others, because the person moves too little, or walks evenly "
             "on; let the person wave, stop and turn in view of all cameras"

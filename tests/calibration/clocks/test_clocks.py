@@ -172,6 +172,12 @@ def test_a_camera_that_never_shows_the_person_is_named() -> None:
         estimate_clocks({"c0": seen, "c1": unseen})
 
 
+def test_recordings_that_their_sound_puts_apart_are_not_said_to_show_too_little_motion() -> None:
+    a, b = smoothed(filmed(0, 2.0, 0.0)), smoothed(filmed(1, 2.0, 0.4))
+    with pytest.raises(InputError, match=r"\+5\.0 s apart, as their sound has them, share fewer than 100 keypoints"):
+        pair_clock(a, b, near_s=5.0)
+
+
 def heard(rng: np.random.Generator, dry: np.ndarray, delay: int) -> np.ndarray:
     """Return a dry sound after `delay` samples, with noise and 30 echoes of its own corner of a room, which together
     are as loud as itself and die down by 60 dB in 0.4 s."""
