@@ -100,6 +100,13 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
 
 def calibrate(options: argparse.Namespace) -> None:
     """Calibrate cameras from footage of a board, or from the person."""
+    other, its = ("boards", ("ground_frame",)) if options.source == "person" else ("person", ("height", "lens", "fov"))
+    for name in its:
+        if getattr(options, name) is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(
+                f"{option}: has no effect with --from {options.source}; leave it out, or give --from {other}"
+            )
     from tasks.cage import run_caged
 
     source = _calibrate_from_person if options.source == "person" else _calibrate_from_boards

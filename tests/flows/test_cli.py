@@ -33,6 +33,14 @@ from tests.shared_data import shared_capture
         (["render", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
         (["calibrate", "absent"], "absent: no such folder"),
         (["calibrate", ".", "--lens", "absent.yml"], "absent.yml: no such file; give --lens another"),
+        (
+            ["calibrate", ".", "--height", "1.8"],
+            "hnerf: --height: has no effect with --from boards; leave it out, or give",
+        ),
+        (
+            ["calibrate", ".", "--from", "person", "--ground-frame", "0"],
+            "--ground-frame: has no effect with --from person",
+        ),
         (["export", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
         (["export", ".", "--motion", "a.bvh"], "a.bvh: no such file; give a BVH file, an AMASS .npz, or another"),
         (["render", ".", "--motion", "a.npz"], "a.npz: no such file; give a BVH file, an AMASS .npz, or another"),
