@@ -24,7 +24,8 @@ def draw_cameras(
     before: Measure | None,
     after: Measure | None,
 ) -> None:
-    """Write the plot as PNG. status: by camera name; before, after: what `measure` returned, None with one camera."""
+    """Write the plot as PNG. status: by camera name; before, after: what `measure` returned, None with
+    one camera, or without keypoints."""
     figure = Figure(figsize=(16, 5.5), layout="constrained")
     above, side, bars = figure.subplots(1, 3)
     vertical = "xyz".index(up)
@@ -34,6 +35,8 @@ def draw_cameras(
         _draw_scene(axes, cameras, status, points_m, (across, along))
         axes.set(title=title, xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[along]} (m)")
         axes.set_aspect("equal", adjustable="datalim")
+    if up == "y":
+        above.invert_yaxis()  # x right and z down, or it would be the view from below
     if before is not None and after is not None:
         _draw_bars(bars, before, after, status)
     else:

@@ -1,11 +1,27 @@
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hnerf.calibration.picture import _draw_scene
+from hnerf.calibration import picture
+from hnerf.calibration.picture import _draw_scene, draw_cameras
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 from tests.calibration.synthetic import STANDING_M, ring
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_from_above_a_ring_goes_round_as_it_does(up: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counter-clockwise about the vertical, whichever axis that is: not mirrored, as seen from below."""
+    drawn = list[Axes]()
+    monkeypatch.setattr(picture, "_draw_scene", lambda *given: drawn.append(given[0]) or _draw_scene(*given))
+    cameras = [dataclasses.replace(c, R=c.R @ Y_UP_FROM_Z_UP.T) if up == "y" else c for c in ring(4)]
+    draw_cameras(tmp_path / "cameras.png", cameras, dict.fromkeys((c.name for c in cameras), "ok"), up, None, None)
+    above = drawn[0]
+    x, y = above.transData.transform([text.xy for text in above.texts]).T
+    assert (np.diff(np.unwrap(np.arctan2(y - y.mean(), x - x.mean()))) > 0).all()
 
 
 def test_a_camera_in_the_origin_is_drawn_too() -> None:
