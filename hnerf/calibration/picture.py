@@ -40,7 +40,8 @@ def draw_cameras(
     if before is not None and after is not None:
         _draw_bars(bars, before, after, status)
     else:
-        bars.text(0.5, 0.5, "one camera: no residuals", ha="center")
+        judged = sum(verdict != "unjudged" for verdict in status.values())
+        bars.text(0.5, 0.5, f"{'one camera' if judged == 1 else 'no keypoints'}: no residuals", ha="center")
         bars.set_axis_off()
     figure.savefig(path, dpi=90)
 

@@ -24,6 +24,15 @@ def test_from_above_a_ring_goes_round_as_it_does(up: str, tmp_path: Path, monkey
     assert (np.diff(np.unwrap(np.arctan2(y - y.mean(), x - x.mean()))) > 0).all()
 
 
+def test_several_cameras_without_keypoints_are_not_called_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = []
+    monkeypatch.setattr(Axes, "text", lambda _, x, y, text, **__: said.append(text))
+    status = {"c0": "ok", "c1": "ok", "c2": "unjudged"}
+    draw_cameras(tmp_path / "cameras.png", ring(3), status, "z", None, None)
+    draw_cameras(tmp_path / "cameras.png", ring(3), {**status, "c1": "unjudged"}, "z", None, None)
+    assert said == ["no keypoints: no residuals", "one camera: no residuals"]
+
+
 def test_a_camera_in_the_origin_is_drawn_too() -> None:
     """Its frustum reaches 0.15 of the 4 m to the person along rays to corners 499.5 px off, at 1000 px focal length."""
     camera = dataclasses.replace(ring(1)[0], R=np.eye(3), t_m=np.zeros(3))
