@@ -54,10 +54,10 @@ class CameraVerdict:
 class CalibrationReport:
     """Result of the calibration check.
 
-    cameras: those to use from here on, test cameras included; verdicts: of the training cameras; before, after: None
-    with one training camera; held_out_px, outlines_px: cost of each correction that was tried, on held-out frames and
-    by the person's outlines; notes: about the whole rig, and checks that could not be made; evidence: None with one
-    training camera; doubts: what in the recording contradicts it.
+    cameras: those to use from here on, test cameras included; verdicts: of the training cameras; before, after,
+    evidence: None with one training camera, or without keypoints; held_out_px, outlines_px: cost of each correction
+    that was tried, on held-out frames and by the person's outlines; notes: about the whole rig, and checks that could
+    not be made; doubts: what in the recording contradicts it.
     """
 
     cameras: dict[str, Camera]
@@ -111,7 +111,7 @@ class CalibrationReport:
         }
 
     def _evidence_to_dict(self) -> dict[str, Any]:
-        """Return the evidence about the cameras as given and as used; empty with one camera."""
+        """Return the evidence about the cameras as given and as used; empty if there is none."""
         if self.evidence is None or self.before is None or self.after is None:
             return {}
         given, judged = self.evidence.capture.cameras, self.evidence.capture.train_cameras

@@ -21,7 +21,7 @@ from hnerf.detection.detect import with_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MAX_FRAMES = 20_000  # of a camera: more are not looked at (eleven minutes at 30 frames a second)
+MAX_FRAMES = 20_000  # of a camera, eleven minutes at 30 frames a second; of more, every second or third is looked at
 
 
 def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:

@@ -49,8 +49,9 @@ class Uncertainty:
 @dataclass(frozen=True)
 class PersonCalibration:
     """Result of a calibration from the person. cameras: of the capture's images, Z up, metres; lenses: as recorded;
-    uncertainty and measured: by camera; scale_sd, up_sd_deg: standard errors of the whole; what: how lenses were
-    found; notes: in words."""
+    uncertainty: by camera; measured: residuals of the keypoints; intrinsics: where each camera's come from, in words;
+    height_m: to which the rig was scaled; scale_sd: standard error of its scale, as a share; up_sd_deg: of up;
+    held_out_px: cost of each kind of lens that was tried."""
 
     cameras: list[Camera]
     lenses: list[Lens]
