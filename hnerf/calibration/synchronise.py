@@ -151,8 +151,9 @@ def _cut_advice(cameras: Sequence[str], offsets: dict[str, float]) -> str:
     cuts = {name: round(offsets.get(name, 0.0) - earliest) for name in cameras}
     orders = ", ".join(f"{cut} from camera {name}" for name, cut in cuts.items() if cut)
     return (
-        f"out of step: {late}; cut frames from the start of recordings: {orders}, and from those of test cameras that "
-        "are as late; then cut all to the same length and ingest again"
+        f"out of step: {late}; run `hnerf synchronise`, after removing clocks.toml if there is one; or cut frames from "
+        f"the start of recordings: {orders}, and from those of test cameras that are as late; then cut all to the same "
+        "length and ingest again"
     )
 
 

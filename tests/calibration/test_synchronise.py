@@ -117,7 +117,7 @@ def test_strided_frames_say_what_to_cut(tmp_path: Path, no_pictures: None) -> No
     capture = capture_of(tmp_path, strided, frames=tuple(range(0, 4 * FRAMES, 4)))
     with pytest.raises(InputError) as caught:
         check_calibration(capture, SETTINGS)
-    assert "camera c0 by -2." in str(caught.value)
+    assert "camera c0 by -2." in str(caught.value) and "run `hnerf synchronise`, " in str(caught.value)
     assert "2 from camera c1, 2 from camera c2, 2 from camera c3" in str(caught.value)
 
 
