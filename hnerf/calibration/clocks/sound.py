@@ -6,6 +6,7 @@ import wave
 from pathlib import Path
 
 import numpy as np
+from scipy.fft import irfft, rfft
 from scipy.signal import resample
 
 from hnerf.capture.safe_io import path_in_capture
@@ -25,18 +26,20 @@ def sound_offset(a: np.ndarray, b: np.ndarray) -> float | None:
 
     Generalised cross-correlation with the phase transform (Knapp and Carter 1976): every frequency counts alike, so
     that the direct sound makes a sharp peak and echoes, which differ between microphones, make lower ones. Sound needs
-    3 ms a metre: microphones at different distances hear it that much apart.
+    3 ms a metre: microphones at different distances hear it that much apart. Hours of sound take gigabytes, so all is
+    in single precision.
     """
     if min(len(a), len(b)) < 2 * RIVAL_S * RATE_HZ or not np.ptp(a) or not np.ptp(b):
         return None
     size = 1 << (len(a) + len(b) - 1).bit_length()
-    spectra = [np.fft.rfft(track - track.mean(), size) for track in (a, b)]
-    cross = np.conj(spectra[0]) * spectra[1]
-    frequencies = np.fft.rfftfreq(size, 1 / RATE_HZ)
-    band = (frequencies >= BAND_HZ[0]) & (frequencies <= BAND_HZ[1])
+    spectra = [rfft(np.asarray(track - track.mean(), np.float32), size) for track in (a, b)]
+    cross = np.conj(spectra[0])
+    cross *= spectra.pop()
+    low, high = (round(hz * size / RATE_HZ) for hz in BAND_HZ)
+    cross[:low], cross[high + 1 :] = 0, 0
     magnitude = np.abs(cross)
-    floor = 1e-3 * magnitude[band].mean() + 1e-30
-    correlation = np.fft.irfft(np.where(band, cross / (magnitude + floor), 0), size)
+    cross /= magnitude + (1e-3 * magnitude[low : high + 1].mean() + 1e-30)
+    correlation = irfft(cross, size)
     best = int(correlation.argmax())
     away = np.ones(size, bool)
     away[(best + np.arange(-round(RIVAL_S * RATE_HZ), round(RIVAL_S * RATE_HZ) + 1)) % size] = False
@@ -59,7 +62,7 @@ def read_sound(path: Path) -> np.ndarray | None:
     command = [program, "-v", "error", "-nostdin", "-i", str(path), "-vn", "-ac", "1", "-ar", str(RATE_HZ),
                "-t", str(MAX_SECONDS), "-f", "s16le", "-"]  # fmt: skip
     done = subprocess.run(command, capture_output=True, check=False)
-    return np.frombuffer(done.stdout, "<i2").astype(np.float64) if done.returncode == 0 and done.stdout else None
+    return np.frombuffer(done.stdout, "<i2").astype(np.float32) if done.returncode == 0 and done.stdout else None
 
 
 def _read_wave(path: Path) -> np.ndarray:
@@ -75,7 +78,8 @@ def _read_wave(path: Path) -> np.ndarray:
         raise InputError(f"{path}: {8 * width} bits at {rate_hz} Hz; export it again as 16-bit PCM at 16 kHz or more")
     if len(samples) < 2 * channels:
         raise InputError(f"{path}: holds no sound; export it again, or remove it")
-    sound = np.frombuffer(samples[: len(samples) - len(samples) % (2 * channels)], "<i2").reshape(-1, channels).mean(1)
+    whole = np.frombuffer(samples[: len(samples) - len(samples) % (2 * channels)], "<i2").reshape(-1, channels)
+    sound = whole.mean(1, dtype=np.float32)
     if rate_hz == RATE_HZ:
         return np.asarray(sound)
     return np.asarray(resample(sound, max(1, round(len(sound) * RATE_HZ / rate_hz))))
