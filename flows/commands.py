@@ -118,7 +118,7 @@ def _calibrate_from_boards(options: argparse.Namespace, out: Path) -> None:
     from hnerf.calibration.boards.calibrate import calibrate_from_boards
 
     found = calibrate_from_boards(options.folder, options.ground_frame)
-    found.save(out, options.format)
+    found.save(out, options.format, pose2sim=(options.folder / "pose").is_dir())
     print(f"{'camera':<12} {'pictures':>8} {'RMS px':>7}  intrinsics")
     report = found.report()
     for name, camera in report["cameras"].items():

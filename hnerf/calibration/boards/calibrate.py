@@ -16,7 +16,7 @@ from hnerf.calibration.boards.lens import LensEstimate, estimate_lens
 from hnerf.calibration.boards.picture import draw_boards
 from hnerf.capture.board_footage import BoardFootage, load_board_corners, read_board_footage
 from hnerf.capture.capture import Capture
-from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.formats.export import write_calibration
 from hnerf.capture.ingest import recognise
 from hnerf.capture.lens import Lens, undistort_points
 from hnerf.capture.safe_io import path_in_capture
@@ -57,10 +57,9 @@ class BoardCalibration:
         }
         return {"frames": found.shape[1], "rms_px": rms(self.fit.error_px()), "cameras": cameras}
 
-    def save(self, out: Path, layouts: Sequence[str] = ()) -> None:
-        """Write `intri.yml`, `extri.yml`, `report.json` and `boards.png`, and the cameras in further layouts."""
-        for layout in {"easymocap", *layouts}:
-            write_cameras(out, list(self.lenses.values()), layout)
+    def save(self, out: Path, layouts: Sequence[str] = (), pose2sim: bool = False) -> None:
+        """Write `report.json` and `boards.png`, and the cameras as `write_calibration` does."""
+        write_calibration(out, list(self.lenses.values()), "boards", layouts, pose2sim)
         (out / "report.json").write_text(json.dumps(self.report(), indent=1))
         draw_boards(out / "boards.png", self.fit)
 

@@ -19,7 +19,7 @@ from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import CHAIN_SD, MEAN_STATURE_M, STATURE_SD_M, scale_to, stand_on_ground
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
-from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.formats.export import write_calibration
 from hnerf.capture.lens import Lens
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.timing import median_step
@@ -94,13 +94,8 @@ class PersonCalibration:
         ]
 
     def save(self, out: Path, layouts: Sequence[str] = (), pose2sim: bool = False) -> None:
-        """Write `report.json` and the cameras, as a capture's folder holds them: in `intri.yml` and `extri.yml`, or,
-        in the layout of Pose2Sim, in `calibration/Calib_person.toml`; and in further layouts."""
-        if pose2sim:
-            write_cameras(out / "calibration", self.lenses, "aniposelib")
-            (out / "calibration" / "calibration.toml").rename(out / "calibration" / "Calib_person.toml")
-        for layout in {*layouts} if pose2sim else {"easymocap", *layouts}:
-            write_cameras(out, self.lenses, layout)
+        """Write `report.json`, and the cameras as `write_calibration` does."""
+        write_calibration(out, self.lenses, "person", layouts, pose2sim)
         (out / "report.json").write_text(json.dumps(self.report(), indent=1))
 
 

@@ -22,6 +22,8 @@ from hnerf.capture.board_footage import Board, BoardCorners, BoardFootage
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.ingest import recognise
 from hnerf.capture.lens import Lens
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -266,6 +268,10 @@ def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pyt
     calibration.save(tmp_path / "out")
     written = EasyMocap(tmp_path / "out").lenses()
     assert written["b"].t_m == pytest.approx(calibration.lenses["b"].t_m) and (tmp_path / "out" / "boards.png").exists()
+    calibration.save(tmp_path / "pose2sim", pose2sim=True)  # beside extri.yml the keypoints in pose/ are not read
+    layout = recognise(tmp_path / "pose2sim")
+    assert isinstance(layout, Pose2Sim)
+    assert layout.lenses()["b"].t_m == pytest.approx(calibration.lenses["b"].t_m)
 
 
 def test_a_board_that_is_found_nowhere_is_hardly_that_board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
