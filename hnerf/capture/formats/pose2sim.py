@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hnerf.capture.footage import Footage, Video
+from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.lens import Lens, by_name, checked_lens
 from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, files_in, read_toml
@@ -29,7 +30,9 @@ class Pose2Sim(Layout):
         return lenses_from_tables(files[0], camera_tables(files[0]))
 
     def footage(self, camera: str) -> Footage:
-        """Return videos/<camera>.mp4."""
+        """Return videos/<camera>.mp4, or, where there is no folder videos/, images/<camera>/ or <camera>.mp4."""
+        if not (self.folder / "videos").is_dir():
+            return EasyMocap(self.folder).footage(camera)
         return Video.open(file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES))
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:

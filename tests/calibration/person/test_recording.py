@@ -1,6 +1,7 @@
 """From a folder of pictures and keypoint files to calibration files and clocks, by the commands."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,8 +16,10 @@ from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.clocks import read_clocks
 from hnerf.capture.formats.easymocap import EasyMocap, write_easymocap
 from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.ingest import ingest
 from hnerf.capture.lens import Lens
 from hnerf.capture.uncalibrated import Uncalibrated
+from hnerf.config import CaptureSettings
 from hnerf.geometry.camera import Camera
 from tests.calibration.clocks.test_clocks import filmed
 from tests.calibration.synthetic import detections, ring
@@ -64,6 +67,8 @@ def test_a_folder_gets_its_cameras(
     found = align([Camera(c.name, lenses[c.name].K, lenses[c.name].R, lenses[c.name].t_m, 1, 1) for c in truth], truth)
     assert max(np.linalg.norm(a.centre_m - b.centre_m) for a, b in zip(found, truth, strict=True)) < 0.03
     assert json.loads((out / "report.json").read_text())["cameras"]["c0"]["uncertainty"]["move_m"] < 0.1
+    shutil.copytree(out, folder, dirs_exist_ok=True)  # as the command says, to use them
+    assert ingest(folder, CaptureSettings(), tmp_path / "ingested").has_keypoints
 
 
 def test_a_folder_gets_its_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
