@@ -71,6 +71,8 @@ class Uncalibrated(Layout):
             raise InputError(f"{file}: has none of the cameras {', '.join(names)}; name them as the recordings are")
         known = {name: KnownLens(lens, f"from {file.name}") for name, lens in given.items() if file and name in names}
         others = [name for name in names if name not in known]
+        if self.fov_deg and not others:
+            raise InputError(f"{file}: has the lenses of all cameras, and --fov is for others; leave out one")
         return known | {name: lens_by_angle(name, self.footage(name), self.fov_deg) for name in others}
 
     def lenses(self) -> dict[str, Lens]:

@@ -17,9 +17,10 @@ from hnerf.capture.clocks import read_clocks
 from hnerf.capture.formats.easymocap import EasyMocap, write_easymocap
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest
-from hnerf.capture.lens import Lens
+from hnerf.capture.lens import Lens, pinhole
 from hnerf.capture.uncalibrated import Uncalibrated
 from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from tests.calibration.clocks.test_clocks import filmed
 from tests.calibration.synthetic import detections, ring
@@ -69,6 +70,16 @@ def test_a_folder_gets_its_cameras(
     assert json.loads((out / "report.json").read_text())["cameras"]["c0"]["uncertainty"]["move_m"] < 0.1
     shutil.copytree(out, folder, dirs_exist_ok=True)  # as the command says, to use them
     assert ingest(folder, CaptureSettings(), tmp_path / "ingested").has_keypoints
+
+
+def test_a_field_of_view_beside_the_lenses_of_all_cameras_is_refused(tmp_path: Path) -> None:
+    """As of a folder into which calibrated cameras were copied; their lenses would be taken."""
+    folder = write_recording(tmp_path / "film", {"c0": np.ones((1, 25, 3)), "c1": np.ones((1, 25, 3))})
+    write_easymocap(folder, [pinhole(camera) for camera in ring(2)])
+    with pytest.raises(InputError, match=r"intri\.yml: has the lenses of all cameras, and --fov is for others"):
+        _ = Uncalibrated(folder, fov_deg=60.0).known_lenses
+    write_easymocap(folder, [pinhole(camera) for camera in ring(1)])
+    assert Uncalibrated(folder, fov_deg=60.0).known_lenses["c1"].source == "60 degrees given"
 
 
 def test_a_folder_gets_its_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
