@@ -14,11 +14,13 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
+from hnerf.capture.timing import median_step
 from hnerf.geometry.camera import Camera
 
 LOSS_SCALE_PX = 0.5  # larger residuals count linearly, not quadratically (soft L1)
 FRAMES_PER_PX = 0.1  # a time offset of this many frames costs as much as a corner one pixel off
 MAX_OFFSET_FRAMES = 1.0  # cameras that start together differ by no more
+MAX_APART = 1.5  # median distances of frame numbers, up to which two frames are neighbours
 MAX_ITERATIONS = 60
 COST_TOLERANCE = 1e-4  # relative; cameras then change by less than a thousandth of a degree
 
@@ -60,7 +62,8 @@ class Adjustment:
     vector: 6 per camera, 6 per frame (rotation, then translation), 1 per image that shows the board.
 
     corners_m (N, 3) on the board; corners_px (C, F, N, 2) undistorted, NaN where not seen, of every `frame_step`-th
-    frame of the footage; offsets are in frames of the footage. Rotations are updated on the left, R <- exp(w) R (Triggs
+    frame of the footage; frames (F,): their numbers, if known, which tell where some are missing; offsets are in frames
+    of the footage. Rotations are updated on the left, R <- exp(w) R (Triggs
     et al. 2000, Bundle Adjustment, section 2.2).
     """
 
@@ -72,6 +75,7 @@ class Adjustment:
         boards: Poses,
         moving: Sequence[bool],
         frame_step: int,
+        frames: Sequence[int] | None = None,
     ) -> None:
         self.cameras, self.corners_m, self.corners_px, self.boards = cameras, corners_m, corners_px, boards
         self.moving, self.frame_step = np.asarray(moving), frame_step
@@ -80,9 +84,11 @@ class Adjustment:
         self.picture, self.corner = np.nonzero(self.seen[self.camera, self.frame])  # of each observation
         self.observed_px = corners_px[self.camera, self.frame][self.picture, self.corner]
         self.K = np.stack([camera.K for camera in cameras])
-        count, frames = corners_px.shape[:2]
-        self.before, self.after = _adjacent_frames(self.seen.any((0, 2)))
-        self.offsets = slice(6 * (count + frames), 6 * (count + frames) + len(self.camera))
+        count, frame_count = corners_px.shape[:2]
+        self.before, self.after = _adjacent_frames(
+            self.seen.any((0, 2)), range(frame_count) if frames is None else frames
+        )
+        self.offsets = slice(6 * (count + frame_count), 6 * (count + frame_count) + len(self.camera))
         self.size = self.offsets.stop
 
     def solve(self) -> BoardFit:
@@ -170,12 +176,14 @@ class Adjustment:
         return boards.R[frame] @ _exp(paths[0]), boards.t_m[frame] + paths[1]
 
 
-def _adjacent_frames(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frame before and the frame after each one; the frame itself where that one is missing. seen: (F,)
-    bool."""
+def _adjacent_frames(seen: np.ndarray, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frame before and the frame after each one; the frame itself where that one is missing, or further away
+    than neighbours usually are. seen: (F,) bool."""
     own = np.arange(len(seen))
     before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(seen) - 1)
-    return np.where(seen[before], before, own), np.where(seen[after], after, own)
+    number, apart = np.asarray(frames), MAX_APART * median_step(frames)
+    near_before, near_after = number - number[before] <= apart, number[after] - number <= apart
+    return np.where(seen[before] & near_before, before, own), np.where(seen[after] & near_after, after, own)
 
 
 def _exp(vectors: np.ndarray) -> np.ndarray:

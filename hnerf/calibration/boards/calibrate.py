@@ -85,7 +85,8 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     )
     cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
-    fit = rig.solve_rig(cameras, corners_m, rig.planar_corners(corners_m, corners_px), footage.frame_step)
+    flat_px = rig.planar_corners(corners_m, corners_px)
+    fit = rig.solve_rig(cameras, corners_m, flat_px, footage.frame_step, footage.frames)
     if ground_frame is not None:
         fit = _on_ground(fit, footage, ground_frame)
     lenses = {c.name: dataclasses.replace(lenses[c.name], R=c.R, t_m=c.t_m) for c in fit.cameras}

@@ -55,12 +55,17 @@ def largest_linked_group(corners_px: np.ndarray) -> np.ndarray:
 
 
 def solve_rig(
-    cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, frame_step: int = 1
+    cameras: Sequence[Camera],
+    corners_m: np.ndarray,
+    corners_px: np.ndarray,
+    frame_step: int = 1,
+    frames: Sequence[int] | None = None,
 ) -> BoardFit:
     """Solve for the poses of cameras with known intrinsics; the first camera is the world.
 
     corners_m (N, 3); corners_px (C, F, N, 2) undistorted, NaN where not seen, of `planar_corners`, in every
-    `frame_step`-th frame of the footage. Raises InputError if the board does not link them.
+    `frame_step`-th frame of the footage; frames (F,): their numbers, if known. Raises InputError if the board does not
+    link them.
     """
     alone = ", ".join(cameras[i].name for i in set(range(len(cameras))).difference(largest_linked_group(corners_px)))
     if alone:
@@ -71,7 +76,8 @@ def solve_rig(
     views = _view_poses(cameras, corners_m, corners_px)
     cameras = _chain_poses(cameras, views)
     boards = _board_poses(cameras, corners_m, corners_px, views)
-    return Adjustment(cameras, corners_m, corners_px, boards, [i > 0 for i in range(len(cameras))], frame_step).solve()
+    moving = [i > 0 for i in range(len(cameras))]
+    return Adjustment(cameras, corners_m, corners_px, boards, moving, frame_step, frames).solve()
 
 
 def solve_boards(

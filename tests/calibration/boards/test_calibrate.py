@@ -1,6 +1,7 @@
 """Board calibration: known cameras around a board on a known path, and real footage."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -52,13 +53,13 @@ def board_at(time: float) -> tuple[np.ndarray, np.ndarray]:
     return facing @ swing, t_m
 
 
-def seen(cameras: list[Camera], lags: dict[str, float]) -> np.ndarray:
+def seen(cameras: list[Camera], lags: dict[str, float], frames: Sequence[int] = range(FRAMES)) -> np.ndarray:
     """Return corners (C, F, N, 2) with noise; a camera with a lag takes every image that much later."""
-    corners_px = np.zeros((len(cameras), FRAMES, len(BOARD.corners_m), 2))
+    corners_px = np.zeros((len(cameras), len(frames), len(BOARD.corners_m), 2))
     for i, camera in enumerate(cameras):
-        for f in range(FRAMES):
-            R, t_m = board_at(f + lags.get(camera.name, 0.0))
-            corners_px[i, f] = camera.project(BOARD.corners_m @ R.T + t_m)[0]
+        for row, frame in enumerate(frames):
+            R, t_m = board_at(frame + lags.get(camera.name, 0.0))
+            corners_px[i, row] = camera.project(BOARD.corners_m @ R.T + t_m)[0]
     return corners_px + NOISE_PX * np.random.default_rng(0).normal(size=corners_px.shape)
 
 
@@ -97,6 +98,16 @@ def test_offsets_count_frames_of_the_footage() -> None:
     lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
     assert lag == pytest.approx(2 * LAG, abs=0.1)
     assert max(figures["turned_deg"] for figures in compare_pairs(cameras, fit.cameras).values()) < 0.3
+
+
+def test_frames_with_a_gap_between_them_are_no_neighbours() -> None:
+    """The board's path does not lead from one burst of images straight to the next: 2 degrees and 5 cm otherwise."""
+    cameras, frames = rig(), [first + i for first in (0, 20, 40, 60) for i in range(4)]
+    corners_px = planar_corners(BOARD.corners_m, seen(cameras, {"b": LAG}, frames))
+    fit = solve_rig(cameras, BOARD.corners_m, corners_px, frames=frames)
+    for figures in compare_pairs(cameras, fit.cameras).values():
+        assert figures["turned_deg"] < 1 and figures["moved_cm"] < 2
+    assert np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0]) == pytest.approx(LAG, abs=0.1)
 
 
 def test_a_corner_off_its_plane_and_a_picture_of_few_are_dropped() -> None:
