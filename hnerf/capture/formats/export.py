@@ -24,8 +24,7 @@ def write_cameras(out: Path, lenses: Sequence[Lens], layout: str) -> None:
 
 def write_calibration(out: Path, lenses: Sequence[Lens], source: str, layouts: Sequence[str], pose2sim: bool) -> None:
     """Write new cameras as a capture's folder holds them: in `intri.yml` and `extri.yml`, or, in the layout of
-    Pose2Sim, whose keypoints are not read beside those, in `calibration/Calib_<source>.toml`; and in further layouts
-    of WRITERS."""
+    Pose2Sim, in `calibration/Calib_<source>.toml`; and in further layouts of WRITERS."""
     if pose2sim:
         write_cameras(out / "calibration", lenses, "aniposelib")
         (out / "calibration" / "calibration.toml").rename(out / "calibration" / f"Calib_{source}.toml")
