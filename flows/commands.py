@@ -123,7 +123,8 @@ def _calibrate_from_boards(options: argparse.Namespace, out: Path) -> None:
     report = found.report()
     for name, camera in report["cameras"].items():
         print(f"{name:<12} {camera['pictures']:>8} {camera['rms_px']:>7.2f}  {camera['intrinsics']}")
-    print(f"all: {report['rms_px']:.2f} px RMS\ncameras: {options.out}\npicture: {options.out / 'boards.png'}")
+    print(f"all: {report['rms_px']:.2f} px RMS\npicture: {options.out / 'boards.png'}")
+    print(f"cameras: {options.out}; copy its files into the capture's folder to use them")
 
 
 def _calibrate_from_person(options: argparse.Namespace, out: Path) -> None:

@@ -15,7 +15,7 @@ from tasks.store import Artifact
 def fit(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact | None, settings: FitSettings
 ) -> dict[str, float]:
-    """Fit one body shape and a pose a frame to keypoints, and to contours if there are masks. Return the seconds of
+    """Fit one body shape and one pose per frame to keypoints, and to contours if there are masks. Return the seconds of
     each part; no file holds them, so that the same body made again is the same artifact."""
     masks = Masks.load(segmentation.root) if segmentation else None
     body, report = fit_body(calibrated_capture(recording, calibration), masks, settings)

@@ -34,7 +34,9 @@ def levels_of(points_m: np.ndarray, faces: np.ndarray, layout: UvLayout, face_co
     found = [whole]
     for count in sorted({count for count in face_counts if count < len(faces)}, reverse=True):
         if count < FACES_PER_SEAM_EDGE * seams:
-            log.warning("no level of detail of %d triangles: the texture's seams have %d edges", count, seams)
+            log.warning(
+                "level of detail of %d triangles left out: the texture's seams alone have %d edges", count, seams
+            )
         else:
             found.append(_decimated(points_m, whole, count))
     return found

@@ -46,7 +46,7 @@ def surface_distances_mm(dense: trimesh.Trimesh, meshes: Mapping[str, AssetMesh]
 def findings(distances_mm: Distances) -> list[str]:
     """Return a line for each region in which the registered mesh does not follow the surface."""
     return [
-        f"{region}: 5 % of the surface are more than {d['p95']:.0f} mm from the registered mesh; loose clothes or long "
+        f"{region}: 5 % of the surface is more than {d['p95']:.0f} mm from the registered mesh; loose clothes or long "
         "hair? asset.topology=captured follows them"
         for region, d in distances_mm.items()
         if region != "all" and d["p95"] > LIMIT_MM

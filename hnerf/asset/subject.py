@@ -42,6 +42,6 @@ def _named(motions: Iterable[Path]) -> dict[str, Motion]:
         called = path.resolve().name if path.is_dir() else path.stem  # a subject's name may have dots
         name = re.sub(r"\W+", "_", called, flags=re.ASCII).strip("_")
         if not name or name in found or name.startswith(CAPTURED):
-            raise InputError(f"{path}: a motion cannot be called {name!r} here, or another is; rename the file")
+            raise InputError(f"{path}: motion name {name!r} is empty, reserved or already in use; rename the file")
         found[name] = read_motion(path)
     return found

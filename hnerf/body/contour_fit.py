@@ -215,7 +215,7 @@ def _ground_contact(vertices_m: np.ndarray, up: int, sole_m: float) -> ContourRe
     """Return the residual of the lowest vertex against a sole on the ground at height 0, where calibrations usually put
     it: with one camera this determines the depth.
 
-    Geman-McClure weights let it go where the body is in the air.
+    Geman-McClure weights release it where the body is in the air.
     """
     lowest = int(vertices_m[:, up].argmin())
     height_m = vertices_m[lowest, up] - sole_m

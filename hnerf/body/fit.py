@@ -1,4 +1,5 @@
-"""Fit the body to a capture: keypoints in space, keypoints in the images, then outlines; one shape, a pose a frame."""
+"""Fit the body to a capture, one shape and one pose per frame: keypoints in space, keypoints in the images, then
+outlines."""
 
 import logging
 import math
@@ -48,7 +49,8 @@ KEYPOINT_STEPS = 30  # Levenberg-Marquardt steps at most; it usually converges b
 # Factor on standard deviations: keypoints alone say little about proportions, and at first nothing about where the
 # detector places keypoints on the body.
 TIGHT_STD = 0.1
-# Ratio to the cost of a pose a frame: 1.1 to 1.3 by keypoint noise alone, 1.4 if joints sway by a degree, 2.0 by two.
+# Ratio to the cost of one pose per frame: 1.1 to 1.3 by keypoint noise alone, 1.4 if joints sway by a degree, 2.0 by
+# two.
 MAX_SINGLE_POSTURE_COST = 1.5
 KNOWN_STATURE_STD_M = 0.02  # of one that `capture.toml` states: shoes, and how it was measured
 MAX_STATURE_SIGMAS = 1.5  # off what is usual, or stated, beyond which a stature that one camera tells is in doubt
@@ -183,8 +185,8 @@ def hold_single_posture(problem: Problem, pose: Pose, posture_prior: PosturePrio
     prior to go on with.
 
     With a single posture all frames together determine the depth of each limb. It is accepted where keypoints and the
-    other priors agree with it nearly as well as with a pose a frame; otherwise each joint keeps the standard deviation
-    that it has.
+    other priors agree with it nearly as well as with one pose per frame; otherwise each joint keeps the standard
+    deviation that it has.
     """
     learned = posture_prior.with_learned_std(pose)
     single = learned.as_single_posture()
@@ -192,7 +194,7 @@ def hold_single_posture(problem: Problem, pose: Pose, posture_prior: PosturePrio
         return pose, learned
     held = levenberg_marquardt(replace(problem, posture_prior=single), pose, problem.image_term, KEYPOINT_STEPS)
     free_cost, held_cost = (problem.assemble(p, problem.image_term)[0] for p in (pose, held))
-    log.info("one posture in all frames costs %.2f times what a pose a frame does", held_cost / free_cost)
+    log.info("one posture in all frames costs %.2f times what one pose per frame does", held_cost / free_cost)
     return (held, single) if held_cost < MAX_SINGLE_POSTURE_COST * free_cost else (pose, learned)
 
 

@@ -1,4 +1,4 @@
-"""The fitted body of a capture: one shape, a pose a frame."""
+"""The fitted body of a capture: one shape, one pose per frame."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,6 +1,6 @@
 """A prior that feet stand on the ground, at height 0, where calibrations usually put it.
 
-With one camera, how far away somebody is follows from where he stands; from his stature alone it is off by decimetres.
+With one camera, a person's distance follows from where they stand; stature alone leaves it decimetres off.
 How far each leg reaches towards the camera follows in the same way, while its foot is down.
 """
 

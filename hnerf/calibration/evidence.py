@@ -13,7 +13,10 @@ from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
 
-NO_OUTLINES = "fewer than two cameras have a mask, or a background from which one could be made"
+NO_OUTLINES = (
+    "fewer than two cameras have a mask, or a background from which one could be made, or no frame shows the person in "
+    "all of them"
+)
 NO_MATCHES = "no overlap: no matches"
 
 

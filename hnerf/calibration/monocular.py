@@ -37,7 +37,7 @@ def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str, stature_m: fl
     seen as keypoints (frames, 25, 3)."""
     measured_m = stature_on_ground_m(camera, keypoints, up)
     if np.isnan(measured_m):
-        return ["world height 0 is not the ground: the camera never sees the person's feet and nose above it"]
+        return ["whether world height 0 is the ground cannot be checked: feet and nose are never both visible"]
     if is_standing(measured_m, stature_m):
         return [f"standing on world height 0 the person is {measured_m:.2f} m tall: ground and scale can be true"]
     known = "" if stature_m is None else f", not {stature_m:.2f} m"

@@ -34,7 +34,7 @@ def _scale_and_pad(camera: Camera, calibrated_px: tuple[int, int], recorded_px: 
 
 # Cropping or padding on the right and at the bottom is not among them: it leaves K as it is.
 SIZE_CHANGES: dict[str, SizeChange] = {
-    "cropped or padded evenly": _crop_or_pad(0.5),
+    "cropped or padded symmetrically": _crop_or_pad(0.5),
     "cropped or padded on the left or at the top": _crop_or_pad(1.0),
     "stretched": _stretch,
     "scaled and padded evenly": _scale_and_pad,

@@ -373,7 +373,7 @@ def _per_frame(
         raise InputError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one for each{nobody}")
     for frame in wanted:
         if frame not in files:
-            raise InputError(f"{place}: {what} of frame {frame} missing; give one for each, numbered as its image is")
+            raise InputError(f"{place}: {what} of frame {frame} missing; give every image one of its number")
     return {frame: files[frame] for frame in wanted}
 
 

@@ -42,7 +42,7 @@ def pinhole(camera: Camera) -> Lens:
 
 def undistort_points(points_px: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     """Map pixels (..., 2) of a recorded image to those of the pinhole camera with the same K; NaN stays, and stands
-    where the lens pictures nothing, for which OpenCV returns any pixel."""
+    outside the lens's valid image area, for which OpenCV returns any pixel."""
     if points_px.size == 0:  # for which OpenCV returns None
         return points_px
     flat = np.ascontiguousarray(points_px.reshape(-1, 1, 2))
@@ -59,7 +59,8 @@ def distort_points(points_px: np.ndarray, K: np.ndarray, distortion: np.ndarray)
 
 
 def undistort_keypoints(keypoints: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Map keypoints (..., 3) x_px, y_px, confidence as `undistort_points` does; 0 where the lens pictures nothing."""
+    """Map keypoints (..., 3) x_px, y_px, confidence as `undistort_points` does; 0 outside the lens's valid image
+    area."""
     straight = undistort_points(keypoints[..., :2], K, distortion)
     pictured = np.isfinite(straight).all(-1, keepdims=True)
     return np.where(pictured, np.concatenate([straight, keypoints[..., 2:]], -1), 0.0)

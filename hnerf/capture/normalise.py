@@ -58,7 +58,7 @@ class Normaliser:
 
     def keypoints(self, recorded: np.ndarray) -> np.ndarray:
         """Convert recorded keypoints (..., 25, 3) x_px, y_px, confidence to the linear camera; points without
-        confidence, and those where the lens pictures nothing, become zero."""
+        confidence, and those outside the lens's valid image area, become zero."""
         if self.maps is not None:
             recorded = undistort_keypoints(recorded, self.lens.K, self.lens.distortion)
         scale = np.array(self.camera.size_px) / self.recorded_size_px
@@ -96,7 +96,7 @@ class Normaliser:
         if (width_px, height_px) != self.recorded_size_px:
             raise InputError(
                 f"{source}: is {width_px} x {height_px} px, but camera {self.lens.name} records "
-                f"{self.recorded_size_px[0]} x {self.recorded_size_px[1]}; give all its pictures one size"
+                f"{self.recorded_size_px[0]} x {self.recorded_size_px[1]}; all images of a camera must have one size"
             )
 
 

@@ -241,7 +241,7 @@ def read_image(path: Path) -> np.ndarray:
 def read_mask(path: Path) -> np.ndarray:
     """Read a mask, (H, W) uint8: the opacity of a person who is cut out of the background, else the lightest of the
     colours. Raises InputError as `read_image` does."""
-    mask = _read_image(path, lambda image: _holes(image) or _colours(image))
+    mask = _read_image(path, lambda image: _opacity(image) or _colours(image))
     return mask if mask.ndim == 2 else mask.max(-1)
 
 
@@ -249,7 +249,7 @@ def _colours(image: Image.Image) -> Image.Image:
     return image if image.mode == "RGB" else image.convert("RGB")
 
 
-def _holes(image: Image.Image) -> Image.Image | None:
+def _opacity(image: Image.Image) -> Image.Image | None:
     """Return the opacity of an image; None where it is opaque everywhere."""
     if image.mode not in ("LA", "RGBA") and "transparency" not in image.info:
         return None

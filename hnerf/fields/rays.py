@@ -1,4 +1,4 @@
-"""What a field is asked: rays, and the posed bodies that they pass."""
+"""What a field is queried with: rays, and the posed bodies that they pass."""
 
 import dataclasses
 from dataclasses import dataclass

@@ -127,7 +127,7 @@ def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[s
     nearly_static = scene.std_rad < MIN_POSE_STD_RAD
     colour_cells = given.colour_cells or _level_cells(COARSEST_CELLS["colour"], scene.side_m / cell_m, COLOUR_LEVELS)
     return {
-        "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, and room"),
+        "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, plus a margin"),
         "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, and room"),
         "samples": Decision(
             max(8, round(MEAN_PATH * (outer_m + inner_m) / sample_m)),
@@ -151,7 +151,7 @@ def _nodes(scene: SceneStatistics, given: FastFieldSettings) -> Decision:
     if not given.deformation_learning_rate:
         return Decision(0, "no learning rate for them")
     if scene.frames == 1:
-        return Decision(0, "one frame: it is the canonical body's own form")
+        return Decision(0, "one frame: its shape is the canonical shape")
     if scene.cameras == 1:
         return Decision(0, "one camera does not see where clothes move")
     return Decision(NODES, f"skinning does not move the clothes of {scene.frames} frames alike")

@@ -54,7 +54,7 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
         f"on the same points of the body, cameras differ from the usual exposure by {np.expm1(furthest):.0%} at most"
     )
     if furthest < MIN_LOG_GAIN:
-        return {}, Decision(1.0, f"{message}: no more than shading may" if logs.any() else "no two cameras to compare")
+        return {}, Decision(1.0, f"{message}: shading can explain it" if logs.any() else "no two cameras to compare")
     gains = {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(names, np.exp(logs), strict=True)}
     return gains, Decision(tuple(round(float(np.mean(g)), 3) for g in gains.values()), message)
 

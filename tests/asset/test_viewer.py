@@ -133,7 +133,7 @@ def test_a_page_that_is_too_large_gets_a_smaller_texture(
     assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (16, 16, 3)
     monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", 1)
     write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
-    assert "viewer.html: over 0 MB; its motion is long" in caplog.text
+    assert "viewer.html: over 0 MB even with a small texture: the motion is long" in caplog.text
 
 
 @NEEDS_THREE
@@ -217,7 +217,7 @@ def test_a_recorded_camera_shows_the_avatar_where_the_recording_has_it(page: Pag
     caption = "document.getElementById('caption').textContent"
     assert page.evaluate(caption) == "Photograph of frame 5"
     page.evaluate("viewer.setTime(0.26)")
-    assert page.evaluate(caption) == "Photograph of frame 5, another instant than the avatar's"
+    assert page.evaluate(caption) == "Photograph of frame 5, not the avatar's current time"
     page.evaluate("viewer.setTime(0.2)")
     assert page.evaluate("viewer.stage.camera.matrixWorld.elements.slice(12, 15)") == pytest.approx([0, 1, 3])
     left, top, width, height = page.evaluate(

@@ -27,7 +27,7 @@ def test_each_change_by_hand() -> None:
     # f = 1000, principal point 499.5, of a picture 80 px wider when calibrated.
     camera = ring(1)[0]
     changed = {what: change(camera, (1080, 1000), (1000, 1000)).K for what, change in SIZE_CHANGES.items()}
-    assert changed["cropped or padded evenly"][0].tolist() == [1000, 0, 459.5]
+    assert changed["cropped or padded symmetrically"][0].tolist() == [1000, 0, 459.5]
     assert changed["cropped or padded on the left or at the top"][0].tolist() == [1000, 0, 419.5]
     # The middle of the picture stays its middle: half of 1000 is 500, half a pixel from the centre at 499.5; 540 of the
     # calibrated 1080 become 500, so what was at 500 comes to lie at 500 * 1000 / 1080 = 462.963.

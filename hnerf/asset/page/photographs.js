@@ -37,7 +37,7 @@ export class Photographs {
     if (this.shown !== photograph) this.image.src = photograph.jpeg;
     this.shown = photograph;
     this.image.classList.toggle("pale", !same);
-    const text = `Photograph of frame ${photograph.frame}${same ? "" : ", another instant than the avatar's"}`;
+    const text = `Photograph of frame ${photograph.frame}${same ? "" : ", not the avatar's current time"}`;
     if (this.caption.textContent !== text) this.caption.textContent = text;
   }
 }

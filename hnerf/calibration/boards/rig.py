@@ -71,7 +71,7 @@ def solve_rig(
     if alone:
         raise InputError(
             f"calibration/extrinsic: camera {alone}: shares fewer than {MIN_SHARED} frames of the board with the other "
-            "cameras; film it where two cameras see it at once"
+            "cameras; film it where two cameras can see it simultaneously"
         )
     views = _view_poses(cameras, corners_m, corners_px)
     cameras = _chain_poses(cameras, views)

@@ -11,7 +11,6 @@ import numpy as np
 from hnerf.capture import safe_io
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.formats.layout import Layout, StoredFrame
-from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.lens import Lens, by_name, checked_lens
 from hnerf.errors import InputError
 from hnerf.strict_yaml import parse_yaml_strings
@@ -46,9 +45,9 @@ class EasyMocap(Layout):
         return Video.open(video)
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return openpose/<camera>/<frame>_keypoints.json by frame, else pose/<camera>_json/ as Pose2Sim does."""
+        """Return openpose/<camera>/<frame>_keypoints.json by frame, else pose/<camera>_json/*.json."""
         files = safe_io.files_in(self.folder, "openpose", camera, suffixes=safe_io.JSON_SUFFIXES)
-        return dict(safe_io.numbered(files, "keypoints")) or Pose2Sim(self.folder).keypoint_files(camera)
+        return dict(safe_io.numbered(files, "keypoints") or enumerate(pose_files(self.folder, camera)))
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return masks/<camera>/<frame>.png, or mask/, by frame."""
@@ -64,6 +63,16 @@ class EasyMocap(Layout):
             raise InputError(f"{folder}: a folder; give one clean plate a camera, as {folder.name}.png beside it")
         plate = safe_io.file_named(self.folder, camera, "background", suffixes=safe_io.IMAGE_SUFFIXES)
         return plate if plate.exists() else None
+
+
+def pose_files(folder: Path, camera: str) -> list[Path]:
+    """Return pose/<camera>_json/*.json, where Pose2Sim has keypoints, one for each video frame: in the order of the
+    numbers in their names, walk_9 before walk_10."""
+
+    def order(path: Path) -> list[str | int]:
+        return [int(part) if i % 2 else part for i, part in enumerate(re.split("([0-9]+)", path.stem))]
+
+    return sorted(safe_io.files_in(folder, "pose", f"{camera}_json", suffixes=safe_io.JSON_SUFFIXES), key=order)
 
 
 def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:

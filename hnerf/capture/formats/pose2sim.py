@@ -1,6 +1,5 @@
 """The Pose2Sim layout: calibration/Calib*.toml, videos/<camera>.mp4, pose/<camera>_json/*.json."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -8,10 +7,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hnerf.capture.footage import Footage, Video
-from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.capture.formats.easymocap import EasyMocap, pose_files
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.lens import Lens, by_name, checked_lens
-from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, files_in, read_toml
+from hnerf.capture.safe_io import VIDEO_SUFFIXES, file_named, files_in, read_toml
 from hnerf.errors import InputError
 
 
@@ -36,14 +35,8 @@ class Pose2Sim(Layout):
         return Video.open(file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES))
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return pose/<camera>_json/*.json, one for each video frame in the order of the numbers in their names."""
-        files = sorted(files_in(self.folder, "pose", f"{camera}_json", suffixes=JSON_SUFFIXES), key=_natural_order)
-        return dict(enumerate(files))
-
-
-def _natural_order(path: Path) -> list[str | int]:
-    """Return a key that sorts walk_9 before walk_10."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split("([0-9]+)", path.stem))]
+        """Return pose/<camera>_json/*.json by video frame."""
+        return dict(enumerate(pose_files(self.folder, camera)))
 
 
 def camera_tables(path: Path) -> dict[str, Any]:
