@@ -37,7 +37,7 @@ SIZE_CHANGES: dict[str, SizeChange] = {
     "cropped or padded symmetrically": _crop_or_pad(0.5),
     "cropped or padded on the left or at the top": _crop_or_pad(1.0),
     "stretched": _stretch,
-    "scaled and padded evenly": _scale_and_pad,
+    "scaled and padded symmetrically": _scale_and_pad,
 }
 
 

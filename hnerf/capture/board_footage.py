@@ -113,12 +113,14 @@ class BoardFootage:
 @dataclass(frozen=True)
 class BoardCorners:
     """Corners of a board in a normalised capture, kept as `boards.npz`: corners_m (N, 3) on the board; corners_px (C,
-    F, N, 2) in the linear cameras' pixels, NaN where not seen, in every `frame_step`-th frame of the footage."""
+    F, N, 2) in the linear cameras' pixels, NaN where not seen, in every `frame_step`-th frame of the footage; frames
+    (F,): their numbers."""
 
     cameras: tuple[str, ...]
     corners_m: np.ndarray
     corners_px: np.ndarray
     frame_step: int
+    frames: tuple[int, ...]
 
     def save(self, root: Path) -> None:
         """Write `boards.npz` into a normalised capture."""
@@ -145,7 +147,7 @@ def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]
         corners = np.concatenate([np.nan_to_num(footage.corners_px[name]), seen], -1)
         straight = normalisers[name].keypoints(corners)
         corners_px.append(np.where(straight[..., 2:] > 0, straight[..., :2], np.nan))
-    return BoardCorners(names, footage.board.corners_m, np.array(corners_px), footage.frame_step)
+    return BoardCorners(names, footage.board.corners_m, np.array(corners_px), footage.frame_step, footage.frames)
 
 
 def load_board_corners(root: Path) -> BoardCorners | None:
@@ -154,7 +156,11 @@ def load_board_corners(root: Path) -> BoardCorners | None:
         return None
     with np.load(root / BOARDS_FILE, allow_pickle=False) as stored:
         return BoardCorners(
-            tuple(stored["cameras"].tolist()), stored["corners_m"], stored["corners_px"], int(stored["frame_step"])
+            tuple(stored["cameras"].tolist()),
+            stored["corners_m"],
+            stored["corners_px"],
+            int(stored["frame_step"]),
+            tuple(stored["frames"].tolist()),
         )
 
 

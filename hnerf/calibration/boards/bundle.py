@@ -63,8 +63,8 @@ class Adjustment:
 
     corners_m (N, 3) on the board; corners_px (C, F, N, 2) undistorted, NaN where not seen, of every `frame_step`-th
     frame of the footage; frames (F,): their numbers, if known, which tell where some are missing; offsets are in frames
-    of the footage. Rotations are updated on the left, R <- exp(w) R (Triggs
-    et al. 2000, Bundle Adjustment, section 2.2).
+    of the footage. Rotations are updated on the left, R <- exp(w) R (Triggs et al. 2000, Bundle Adjustment, section
+    2.2).
     """
 
     def __init__(

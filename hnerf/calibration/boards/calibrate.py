@@ -111,7 +111,7 @@ def board_evidence(capture: Capture) -> dict[str, Any] | None:
     if len(chosen) < 2:
         return {"frames": corners_px.shape[1], "cameras": {}, "pairs": {}, "unlinked_cameras": names}
     cameras, corners_px = [cameras[i] for i in chosen], corners_px[chosen]
-    seen = stored.corners_m, corners_px, stored.frame_step
+    seen = stored.corners_m, corners_px, stored.frame_step, stored.frames
     own, given = (solve(cameras, *seen) for solve in (rig.solve_rig, rig.solve_boards))
     figures = {
         camera.name: _figures(given, i) | {"footage_rms_px": rms(own.error_px(i))} for i, camera in enumerate(cameras)

@@ -81,11 +81,15 @@ def solve_rig(
 
 
 def solve_boards(
-    cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, frame_step: int = 1
+    cameras: Sequence[Camera],
+    corners_m: np.ndarray,
+    corners_px: np.ndarray,
+    frame_step: int = 1,
+    frames: Sequence[int] | None = None,
 ) -> BoardFit:
     """Solve as `solve_rig` does, with fixed cameras."""
     boards = _board_poses(cameras, corners_m, corners_px, _view_poses(cameras, corners_m, corners_px))
-    return Adjustment(cameras, corners_m, corners_px, boards, [False] * len(cameras), frame_step).solve()
+    return Adjustment(cameras, corners_m, corners_px, boards, [False] * len(cameras), frame_step, frames).solve()
 
 
 def compare_pairs(cameras: Sequence[Camera], others: Sequence[Camera]) -> dict[str, dict[str, float]]:

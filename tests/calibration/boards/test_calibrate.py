@@ -135,17 +135,17 @@ def test_board_evidence_names_cameras_it_knows_nothing_about(tmp_path: Path) -> 
     corners_px = seen(rig(), {})
     corners_px[2] = np.nan
     capture = write_capture(tmp_path, rig(), {camera.name: np.zeros((2, 1, 25, 3)) for camera in rig()})
-    BoardCorners(("a", "b", "c"), BOARD.corners_m, corners_px, 1).save(capture.root)
+    BoardCorners(("a", "b", "c"), BOARD.corners_m, corners_px, 1, tuple(range(FRAMES))).save(capture.root)
     found = board_evidence(capture)
     assert found is not None and found["unlinked_cameras"] == ["c"] and list(found["cameras"]) == ["a", "b"]
-    BoardCorners(("a",), BOARD.corners_m, corners_px[:1], 1).save(capture.root)
+    BoardCorners(("a",), BOARD.corners_m, corners_px[:1], 1, tuple(range(FRAMES))).save(capture.root)
     found = board_evidence(capture)
     assert found is not None and found["unlinked_cameras"] == ["a"] and found["cameras"] == {}
 
 
 def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
     cameras = rig()
-    stored = BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {}), 1)
+    stored = BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {}), 1, tuple(range(FRAMES)))
     bumped = [cameras[0], turned(cameras[1], 1.0), cameras[2]]
     capture = write_capture(tmp_path / "bumped", bumped, {camera.name: np.zeros((2, 1, 25, 3)) for camera in cameras})
     assert board_evidence(capture) is None
@@ -158,6 +158,17 @@ def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
     assert max(camera["footage_rms_px"] for camera in found["cameras"].values()) < 0.2
     assert found["pairs"]["a-b"]["turned_deg"] == pytest.approx(1.0, abs=0.1)
     assert found["pairs"]["a-c"]["turned_deg"] < 0.1
+
+
+def test_board_evidence_knows_where_frames_are_missing(tmp_path: Path) -> None:
+    """In bursts of images, of which b takes each LAG later, the cameras still agree with themselves."""
+    cameras, frames = rig(), tuple(first + i for first in (0, 20, 40, 60) for i in range(4))
+    capture = write_capture(tmp_path, cameras, {camera.name: np.zeros((2, 1, 25, 3)) for camera in cameras})
+    BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {"b": LAG}, frames), 1, frames).save(capture.root)
+    found = board_evidence(capture)
+    assert found is not None
+    assert max(camera["footage_rms_px"] for camera in found["cameras"].values()) < 0.6
+    assert max(pair["turned_deg"] for pair in found["pairs"].values()) < 1
 
 
 def test_visible_means_facing_inside_and_found_by_another() -> None:
