@@ -68,7 +68,7 @@ LAYOUTS: tuple[type[Layout], ...] = (
 )  # the first that recognises a folder
 BLACK = 8  # grey level that noise and an encoder leave of black
 MAX_NAMED = 5  # in a warning
-BY_CAMERA = ("images", "videos", "openpose", "masks", "mask", "background")  # folders of EasyMocap
+BY_CAMERA = ("images", "openpose", "masks", "mask", "background")  # folders of EasyMocap
 READ_SUFFIXES = VIDEO_SUFFIXES + IMAGE_SUFFIXES + JSON_SUFFIXES
 BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 
@@ -89,8 +89,9 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         _warn_of_unread(folder, ("keypoints",), set(lenses))
     if isinstance(layout, EasyMocap):
         _warn_of_unread(folder, BY_CAMERA, set(lenses))
-    if isinstance(layout, Pose2Sim):
+    if isinstance(layout, EasyMocap | Pose2Sim) and not isinstance(layout, Videos):  # a lone video has any name
         _warn_of_unread(folder, ("videos",), set(lenses))
+    if isinstance(layout, Pose2Sim):
         _warn_of_unread(folder, ("pose",), {f"{name}_json" for name in lenses})
     manifest = _manifest_for(layout, folder)
     subject = capture_name(folder, manifest)

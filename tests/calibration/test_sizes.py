@@ -32,7 +32,10 @@ def test_each_change_by_hand() -> None:
     # The middle of the picture stays its middle: half of 1000 is 500, half a pixel from the centre at 499.5; 540 of the
     # calibrated 1080 become 500, so what was at 500 comes to lie at 500 * 1000 / 1080 = 462.963.
     assert changed["stretched"][:2].round(3).tolist() == [[925.926, 0, 462.463], [0, 1000, 499.5]]
-    assert changed["scaled and padded symmetrically"][:2].round(3).tolist() == [[925.926, 0, 462.463], [0, 925.926, 499.5]]
+    assert changed["scaled and padded symmetrically"][:2].round(3).tolist() == [
+        [925.926, 0, 462.463],
+        [0, 925.926, 499.5],
+    ]
 
 
 def test_changes_are_the_same_in_a_picture_that_was_shrunk() -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from hnerf.capture.footage import Footage, Video
-from hnerf.capture.formats.layout import Layout
+from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import read_manifest
-from hnerf.capture.safe_io import VIDEO_SUFFIXES, check_camera_name, files_in
+from hnerf.capture.safe_io import VIDEO_SUFFIXES, check_camera_name, files_in, path_in_capture
 from hnerf.capture.uncalibrated import USUAL_FOCAL, lens_by_angle
 from hnerf.errors import InputError
 from hnerf.geometry.axes import CAMERA_FROM_Z_UP
@@ -22,9 +22,10 @@ log = logging.getLogger("hnerf.capture")
 
 
 @dataclass(frozen=True)
-class Videos(Layout):
-    """Videos of a person. One needs no calibration: the camera is held level, with the field of view that
-    `capture.toml` states. Several need each other's places."""
+class Videos(EasyMocap):
+    """Videos of a person, with keypoints, masks and clean plates beside them as EasyMocap has them. One needs no
+    calibration: the camera is held level, with the lens of `intri.yml`, or the field of view that `capture.toml`
+    states. Several need each other's places."""
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
@@ -32,14 +33,20 @@ class Videos(Layout):
         return bool(_videos(folder))
 
     def lenses(self) -> dict[str, Lens]:
-        """Return the one camera: at the origin, with the longer side's field of view, and Z up."""
+        """Return the one camera: at the origin, with its lens in `intri.yml`, else the longer side's field of view, and
+        Z up."""
         videos = _videos(self.folder)
         if len(videos) > 1:
             raise InputError(
                 f"{self.folder}: {len(videos)} videos without calibration; `hnerf calibrate {self.folder} --from "
                 "person` finds their cameras from the person, --from boards from footage of a board"
             )
-        name = _camera_name(videos[0])
+        name, file = _camera_name(videos[0]), self.folder / "intri.yml"
+        if self.folder.is_dir() and path_in_capture(self.folder, file.name).exists():
+            given = read_intrinsics(file)
+            if name not in given:
+                raise InputError(f"{file}: has no camera {name}; name it as the video is")
+            return {name: dataclasses.replace(given[name], R=CAMERA_FROM_Z_UP)}
         stated = read_manifest(self.folder).field_of_view_deg
         known = lens_by_angle(name, Video(videos[0], (0,), None), stated)
         if not known.source:

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.capture import Capture, SubjectPoint, write_image
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
-from tests.capture.recordings import write_calibration, write_easymocap, write_video
+from hnerf.geometry.axes import CAMERA_FROM_Z_UP
+from tests.capture.recordings import HEIGHT, WIDTH, K, write_calibration, write_easymocap, write_keypoints, write_video
 
 SETTINGS = CaptureSettings()
 
@@ -83,6 +84,29 @@ def test_the_world_of_one_camera_has_z_up(tmp_path: Path) -> None:
     (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')
     message = "capture.toml: up: z is up where one camera makes the world; remove the line"
     assert message in refused(tmp_path / "ada", tmp_path / "out")
+
+
+def test_what_is_known_of_a_lone_video_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Its lens, keypoints, masks and clean plate, in EasyMocap's layout; the lens of another camera is refused."""
+    folder = tmp_path / "ada"
+    write_video(folder / "videos" / "01.mp4", 3, (WIDTH, HEIGHT))
+    write_calibration(folder)
+    (folder / "extri.yml").unlink()
+    for frame in range(3):
+        write_keypoints(folder / "openpose" / "01" / f"{frame:06d}_keypoints.json", [np.tile([9.0, 9, 0.5], (25, 1))])
+        write_image(
+            folder / "masks" / "01" / f"{frame:06d}.png", np.full((HEIGHT, WIDTH), 255 * (frame == 1), np.uint8)
+        )
+    write_image(folder / "background" / "01.png", np.full((HEIGHT, WIDTH, 3), 9, np.uint8))
+    found = ingest(folder, SETTINGS, tmp_path / "out")
+    np.testing.assert_allclose(found.cameras["01"].K, K)
+    np.testing.assert_allclose(found.cameras["01"].R, CAMERA_FROM_Z_UP)
+    assert found.keypoints("01") is not None and "WARNING" not in caplog.text
+    masks, plate = [found.given_mask("01", frame) for frame in range(3)], found.background("01")
+    assert [mask is not None and bool(mask.all()) for mask in masks] == [False, True, False]
+    assert plate is not None and (plate == 9).all()
+    (folder / "videos" / "01.mp4").rename(folder / "videos" / "front.mp4")
+    assert refused(folder, tmp_path / "again").endswith("intri.yml: has no camera front; name it as the video is")
 
 
 def test_several_videos_need_cameras(tmp_path: Path) -> None:
