@@ -4,6 +4,7 @@
 t_own = (1 + drift_ppm / 10^6) t + offset_s.
 """
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,9 @@ from hnerf.errors import InputError
 
 FILE = "clocks.toml"
 IRREGULAR = 0.5  # of a frame's duration: by which a video's frames may be off an even rate
+NOTICED_S = 0.1  # off an even rate, beyond which motion looks too fast or too slow
+
+log = logging.getLogger("hnerf.capture")
 
 
 class Clock(NamedTuple):
@@ -109,15 +113,22 @@ def in_step(
     images without a rate of their own. Raises InputError where a clock is missing, or the recordings do not overlap.
     """
     times_s = {name: frame_times_s(one, fps) for name, one in footage.items()}
+    slowest = max(footage, key=lambda name: (round(_step_s(times_s[name]), 4), _regular(times_s[name])))
     uneven = any(
         isinstance(one, Video) and one.times_s and not _regular(times_s[name]) for name, one in footage.items()
     )
+    if uneven and (off_s := _unevenness_s(times_s[slowest])) > NOTICED_S:
+        log.warning(
+            "%s: frames come up to %.1f s off an even rate, by which they count: motion is too fast or too slow in "
+            "places; convert it to a constant rate",
+            footage[slowest].path,
+            off_s,
+        )
     if not clocks and (len(footage) == 1 or not uneven):
         return dict(footage)
     clocks = clocks or dict.fromkeys(footage, Clock())
     if missing := sorted(set(footage).difference(clocks)):
         raise InputError(f"{FILE}: camera {missing[0]} is missing; run `hnerf synchronise` again, or add it")
-    slowest = max(footage, key=lambda name: (round(_step_s(times_s[name]), 4), _regular(times_s[name])))
     instants_s = (times_s[slowest] - clocks[slowest].offset_s) / clocks[slowest].rate
     own = {
         name: _frames_at(np.asarray(one.frames), times_s[name], clocks[name].rate * instants_s + clocks[name].offset_s)
@@ -146,8 +157,12 @@ def _step_s(times_s: np.ndarray) -> float:
 
 
 def _regular(times_s: np.ndarray) -> bool:
+    return _unevenness_s(times_s) <= IRREGULAR * max(_step_s(times_s), 1e-9)
+
+
+def _unevenness_s(times_s: np.ndarray) -> float:
     even = np.linspace(times_s[0], times_s[-1], len(times_s))
-    return bool(np.abs(times_s - even).max() <= IRREGULAR * max(_step_s(times_s), 1e-9))
+    return float(np.abs(times_s - even).max())
 
 
 def _frames_at(frames: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:

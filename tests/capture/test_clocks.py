@@ -139,6 +139,16 @@ def test_the_rate_is_that_of_the_camera_whose_frames_are_counted(tmp_path: Path)
     assert ingested(tmp_path / "film", tmp_path / "out").fps == pytest.approx(25)
 
 
+def test_a_lone_video_at_an_uneven_rate_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Of 20 frames of 40 ms, the last ten last twice as long; after ten, 0.4 s, an even rate has 0.6 s."""
+    write_video(tmp_path / "film" / "a.mp4", [10 * k for k in range(20)])
+    ingest(tmp_path / "film", CaptureSettings(), tmp_path / "even")
+    assert "off an even rate" not in caplog.text
+    hold_frames(tmp_path / "film" / "a.mp4", 10, 10)
+    ingest(tmp_path / "film", CaptureSettings(), tmp_path / "uneven")
+    assert "a.mp4: frames come up to 0.2 s off an even rate" in caplog.text
+
+
 def test_a_rotation_in_the_metadata_is_honoured(tmp_path: Path) -> None:
     video = tmp_path / "a.mp4"
     write_video(video, [200] * 3)
