@@ -30,8 +30,8 @@ RECORDED = SimpleNamespace(
     test_cameras=("5",),
     train_frames=(0, 1, 2),
     frames=(0, 1, 2),
-    root=Path("nowhere"),
     recorded_frame=lambda _, frame: frame,
+    has_given_mask=lambda *_: False,
 )
 STUDY = """
 title: Toys
@@ -81,7 +81,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
     monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
     monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
     monkeypatch.setattr(module, "read_capture", lambda *_: (None, SimpleNamespace(root=tmp_path)))
-    (tmp_path / "ground_truth" / "masks").mkdir(parents=True)
+    true_mask(tmp_path).parent.mkdir(parents=True)
+    true_mask(tmp_path).touch()
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: RECORDED)
     monkeypatch.setattr(module.Capture, "load", lambda _: RECORDED)
     monkeypatch.setattr(module, "train", train)
@@ -99,6 +100,11 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def study(tmp_path: Path) -> str:
     (tmp_path / "toys.yaml").write_text(STUDY)
     return str(tmp_path / "toys.yaml")
+
+
+def true_mask(folder: Path) -> Path:
+    """Return the one that the test camera has."""
+    return folder / "ground_truth" / "masks" / "5" / "000000.png"
 
 
 def read(table: Path) -> dict[str, Any]:
@@ -153,10 +159,8 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
     assert (nerf["ended"], [row["seconds"] for row in nerf["curve"]]) == ("flat", list(psnr))
     assert [training.seconds for _, training in stages][-2:] == [640.0, 640.0]  # the second is in the store
     assert nerf["novel_view"]["psnr"] == 25.05
-    (tmp_path / "ground_truth" / "masks").rmdir()  # those of the recording will do
-    (tmp_path / "masks" / "5").mkdir(parents=True)
-    (tmp_path / "masks" / "5" / "000000.png").touch()
-    monkeypatch.setattr(RECORDED, "root", tmp_path)
+    true_mask(tmp_path).unlink()
+    monkeypatch.setattr(RECORDED, "has_given_mask", lambda *_: True)  # those of the recording will do
     (tmp_path / "mine.yaml").write_text(f"{text}100")
     found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))
     assert found["variants"]["one"]["methods"]["nerf"]["ended"] == "limit"
@@ -188,7 +192,7 @@ def test_nothing_is_trained_until_flat_where_no_image_can_be_scored(
     stages: Stages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lacks: str
 ) -> None:
     if lacks == "masks":
-        (tmp_path / "ground_truth" / "masks").rmdir()
+        true_mask(tmp_path).unlink()
     else:
         monkeypatch.setattr(RECORDED, "test_cameras", ())
     with pytest.raises(InputError, match="ada: no image can be scored, so no curve can become flat; add test cameras"):
