@@ -118,7 +118,7 @@ def _calibrate_from_boards(options: argparse.Namespace, out: Path) -> None:
     from hnerf.calibration.boards.calibrate import calibrate_from_boards
 
     found = calibrate_from_boards(options.folder, options.ground_frame)
-    found.save(out, options.format, pose2sim=(options.folder / "pose").is_dir())
+    found.save(out, options.format, _is_pose2sim(options.folder))
     print(f"{'camera':<12} {'pictures':>8} {'RMS px':>7}  intrinsics")
     report = found.report()
     for name, camera in report["cameras"].items():
@@ -131,13 +131,18 @@ def _calibrate_from_person(options: argparse.Namespace, out: Path) -> None:
     from hnerf.calibration.person.recording import calibrate_recording
 
     found = calibrate_recording(options.folder, options.height, options.lens, options.fov)
-    found.save(out, options.format, pose2sim=(options.folder / "pose").is_dir())
+    found.save(out, options.format, _is_pose2sim(options.folder))
     print(f"{'camera':<12} {'median px':>9} {'+- degrees':>10} {'+- cm':>6} {'+- % focal':>10}  intrinsics")
     for name, camera in found.report()["cameras"].items():
         off = camera["uncertainty"]
         figures = f"{off['turn_deg']:>10.2f} {100 * off['move_m']:>6.1f} {100 * off['focal']:>10.1f}"
         print(f"{name:<12} {camera['median_px']:>9.2f} {figures}  {camera['intrinsics']}")
     print("\n".join([*found.notes(), f"cameras: {options.out}; copy its files into {options.folder} to use them"]))
+
+
+def _is_pose2sim(folder: Path) -> bool:
+    """Return whether a recording is read in the layout of Pose2Sim, once it has a calibration of that layout."""
+    return (folder / "pose").is_dir() and not (folder / "extri.yml").exists()
 
 
 def synchronise(options: argparse.Namespace) -> None:

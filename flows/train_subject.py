@@ -87,8 +87,9 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     subject = normalised.name
     artifact_store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
     artifact_store.link_latest(subject, recorded)
-    recording = artifact_store.link_latest(subject, with_detections(artifact_store, recorded, settings))
+    recording = with_detections(artifact_store, recorded, settings)
     artifact_store.unlink_latest(subject, OPTIONAL - {recording.stage})
+    artifact_store.link_latest(subject, recording)
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
     segmentation = artifact_store.link_latest(

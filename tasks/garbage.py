@@ -34,7 +34,7 @@ class Garbage:
     @property
     def what(self) -> str:
         """Return a word for it."""
-        return "unfinished" if self.left else "artifact"
+        return "leftover" if self.left else "artifact"
 
 
 def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbage]:

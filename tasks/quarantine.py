@@ -11,16 +11,17 @@ from tasks.ledger import was_started
 
 FOLDER = ".refused"
 REMEDY = (
-    "Correct the folder: a capture that has changed is tried again by itself. If the folder is not to blame, repeat "
-    "its flow run: prefect flow-run retry ID. This note goes when a run succeeds, or with the folder."
+    "Correct the folder: a capture that has changed is tried again by itself. This note goes when a run succeeds, or "
+    "with the folder."
 )
+REPEAT = "If the folder is not to blame, repeat its flow run: prefect flow-run retry ID."
 
 
-def note(capture: Path, why: str) -> None:
-    """Say why a capture gave no result."""
+def note(capture: Path, why: str, remedy: str = REMEDY) -> None:
+    """Say why a capture gave no result, and what to do."""
     path = _path(capture)
     path.parent.mkdir(exist_ok=True)
-    text = f"{printable(capture.name)}: {printable(why)}\n\n{REMEDY}\n"
+    text = f"{printable(capture.name)}: {printable(why)}\n\n{remedy}\n"
     if path.is_symlink() or not path.is_file() or path.read_text(errors="replace").partition("\n\nSeen ")[0] != text:
         replace_text(path, f"{text}\n\nSeen {time.strftime('%Y-%m-%d %H:%M:%S %z')}\n")
 
@@ -29,7 +30,7 @@ def note_run(capture: Path | str, store: Path, why: str) -> None:
     """Say why a run gave no result, if its capture was started from a watched folder (not in a bucket)."""
     if isinstance(capture, Path) and was_started(store, capture):
         with suppress(OSError):  # a folder that may only be read, or is gone
-            note(capture, why)
+            note(capture, why, f"{REMEDY} {REPEAT}")
 
 
 def clear(capture: Path) -> None:

@@ -199,7 +199,7 @@ def _fit_reasons(name: str, before: Measure, settings: CalibrationSettings) -> l
         )
     if before.misfit == name:
         falls = f"from {before.cost_px:.1f} to {before.cost_without_px[name]:.1f} px"
-        reasons.append(f"as given, an outlier: without it the trimmed cost of the others falls {falls}")
+        reasons.append(f"as given, an outlier: without it the trimmed cost falls {falls}")
     return reasons
 
 

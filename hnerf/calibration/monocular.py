@@ -37,7 +37,10 @@ def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str, stature_m: fl
     seen as keypoints (frames, 25, 3)."""
     measured_m = stature_on_ground_m(camera, keypoints, up)
     if np.isnan(measured_m):
-        return ["whether world height 0 is the ground cannot be checked: feet and nose are never both visible"]
+        return [
+            "whether world height 0 is the ground cannot be checked: no frame shows the nose together with a foot "
+            "whose line of sight meets height 0"
+        ]
     if is_standing(measured_m, stature_m):
         return [f"standing on world height 0 the person is {measured_m:.2f} m tall: ground and scale can be true"]
     known = "" if stature_m is None else f", not {stature_m:.2f} m"

@@ -102,7 +102,7 @@ def _refine_one_by_one(
 
     Adds the cost of everything tried to `held_out_px`; also returns the reasons why the other cameras stay as they are.
     """
-    kept = {camera.name: "pose not refined: that needs two other cameras" for camera in cameras}
+    kept = {camera.name: "pose kept: refining it needs two other cameras" for camera in cameras}
     cost_px, changes, zoomed = held_out_px["as given"], dict[str, str](), tuple[str, ...]()
     for _ in cameras[2:]:
         tried = {}

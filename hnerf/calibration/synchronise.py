@@ -252,7 +252,7 @@ def _timing(view: _View) -> Timing:
     elif max(abs(half - lowest) for half in lowest_of_half) > 1:
         reason = f"the halves of the frames disagree: {' and '.join(f'{step * half:+d}' for half in lowest_of_half)}"
     elif lowest in (min(costs), max(costs)):
-        reason = f"the best shift is at the end of the range searched, {max(costs) * step} frames"
+        reason = f"the best shift is at the end of the range searched, {lowest * step:+d} frames"
     first, second = (parabola.vertex(half) * step for half in halves)
     return Timing(parabola.vertex(every) * step, error * step, (first, second), reason)
 

@@ -113,22 +113,15 @@ def in_step(
     images without a rate of their own. Raises InputError where a clock is missing, or the recordings do not overlap.
     """
     times_s = {name: frame_times_s(one, fps) for name, one in footage.items()}
-    slowest = max(footage, key=lambda name: (round(_step_s(times_s[name]), 4), _regular(times_s[name])))
     uneven = any(
         isinstance(one, Video) and one.times_s and not _regular(times_s[name]) for name, one in footage.items()
     )
-    if uneven and (off_s := _unevenness_s(times_s[slowest])) > NOTICED_S:
-        log.warning(
-            "%s: frames come up to %.1f s off an even rate, by which they count: motion is too fast or too slow in "
-            "places; convert it to a constant rate",
-            footage[slowest].path,
-            off_s,
-        )
     if not clocks and (len(footage) == 1 or not uneven):
         return dict(footage)
     clocks = clocks or dict.fromkeys(footage, Clock())
     if missing := sorted(set(footage).difference(clocks)):
         raise InputError(f"{FILE}: camera {missing[0]} is missing; run `hnerf synchronise` again, or add it")
+    slowest = max(footage, key=lambda name: (round(_step_s(times_s[name]), 4), _regular(times_s[name])))
     instants_s = (times_s[slowest] - clocks[slowest].offset_s) / clocks[slowest].rate
     own = {
         name: _frames_at(np.asarray(one.frames), times_s[name], clocks[name].rate * instants_s + clocks[name].offset_s)
@@ -142,6 +135,17 @@ def in_step(
         name: InStep(one, dict(zip(numbers.tolist(), own[name][shared].tolist(), strict=True)), footage[slowest].fps)
         for name, one in footage.items()
     }
+
+
+def warn_if_uneven(one: ImageFolder | Video) -> None:
+    """Warn of a video by itself whose frames, which count as evenly spaced, are not."""
+    if isinstance(one, Video) and one.times_s and (off_s := _unevenness_s(np.asarray(one.times_s))) > NOTICED_S:
+        log.warning(
+            "%s: frames come up to %.1f s off an even rate, by which they count: motion is too fast or too slow in "
+            "places; convert it to a constant rate",
+            one.path,
+            off_s,
+        )
 
 
 def frame_times_s(footage: ImageFolder | Video, fps: float) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import KEYPOINTS, Capture, SubjectPoint
-from hnerf.capture.clocks import InStep, in_step, read_clocks
+from hnerf.capture.clocks import InStep, in_step, read_clocks, warn_if_uneven
 from hnerf.capture.footage import Footage, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
@@ -88,10 +88,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     if not uncalibrated:
         _warn_of_unread(folder, ("keypoints",), set(lenses))
     if isinstance(layout, EasyMocap):
-        _warn_of_unread(folder, BY_CAMERA, set(lenses))
-    if isinstance(layout, EasyMocap | Pose2Sim) and not isinstance(layout, Videos):  # a lone video has any name
-        _warn_of_unread(folder, ("videos",), set(lenses))
-    if isinstance(layout, Pose2Sim):
+        places = BY_CAMERA if isinstance(layout, Videos) else (*BY_CAMERA, "videos")  # a lone video has any name
+        _warn_of_unread(folder, places, set(lenses))
         _warn_of_unread(folder, ("pose",), {f"{name}_json" for name in lenses})
     manifest = _manifest_for(layout, folder)
     subject = capture_name(folder, manifest)
@@ -99,6 +97,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     filmed = {name: layout.footage(name) for name in cameras.train + cameras.test}
     clocks = {} if len(filmed) == 1 else read_clocks(folder)
     footage = in_step(filmed, clocks, manifest.fps or DEFAULT_FPS)
+    if len(filmed) == 1 and not uncalibrated:
+        warn_if_uneven(*filmed.values())
     recorded = _common_frames(footage)
     _check_subject(folder, manifest, {name: {*recorded, *filmed[name].frames} for name in cameras.train})
     people = _people_in_step(layout, footage)
@@ -374,7 +374,7 @@ def _per_frame(
         raise InputError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one for each{nobody}")
     for frame in wanted:
         if frame not in files:
-            raise InputError(f"{place}: {what} of frame {frame} missing; give every image one of its number")
+            raise InputError(f"{place}: {what} of frame {frame} missing; give one for each image, of its number")
     return {frame: files[frame] for frame in wanted}
 
 

@@ -39,7 +39,7 @@ def views_with_mask(views: list[View], truth: Truth) -> list[View]:
 
 def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], out: Path) -> float:
     """Render every view with its split's avatar, in the poses of its `body`, and write it as 8-bit RGBA, colour over
-    black and coverage. Return the seconds of wall clock an image; on a CPU, several are rendered at a time."""
+    black and coverage. Return the wall-clock seconds per image; on a CPU, several are rendered at a time."""
 
     def write(view: View) -> None:
         body = avatars[view.split].body

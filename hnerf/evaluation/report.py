@@ -325,7 +325,7 @@ def readable(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
+        return f"{value:.4g}" if abs(value) < 9999.5 else f"{value:.0f}"
     if isinstance(value, list | tuple):
         flat = list(_leaves(value))
         if len(flat) > LONG_LIST and all(isinstance(v, int | float) for v in flat):

@@ -52,10 +52,8 @@ def area_jumps(frames: tuple[int, ...], verdicts: list[MaskVerdict], expected_px
     ratio = area_px / np.maximum(expected_px, 1)
     usable = np.array([v.fault is None for v in verdicts])
     reach = NEIGHBOURS * median_step(frames)
-    first, end = (
-        np.searchsorted(frames, np.array(frames) - reach),
-        np.searchsorted(frames, np.array(frames) + reach + 1),
-    )
+    first = np.searchsorted(frames, np.array(frames) - reach)
+    end = np.searchsorted(frames, np.array(frames) + reach + 1)
     for i, frame in enumerate(frames):
         others = [j for j in range(first[i], end[i]) if j != i and usable[j]]
         near = sorted(others, key=lambda j: abs(frames[j] - frame))[:NEIGHBOURS]

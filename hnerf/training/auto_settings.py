@@ -128,7 +128,7 @@ def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[s
     colour_cells = given.colour_cells or _level_cells(COARSEST_CELLS["colour"], scene.side_m / cell_m, COLOUR_LEVELS)
     return {
         "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, plus a margin"),
-        "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, and room"),
+        "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, plus a margin"),
         "samples": Decision(
             max(8, round(MEAN_PATH * (outer_m + inner_m) / sample_m)),
             f"one each {_mm(sample_m)} of a ray through a shell of {_mm(outer_m + inner_m)}",

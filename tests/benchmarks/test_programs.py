@@ -9,6 +9,7 @@ from registry import REGISTRY
 
 PROGRAMS = sorted({result.command[0].removesuffix(".py") for result in REGISTRY})
 STORE = ("store",)
+REFUSED = 77  # no exit code of argparse
 POSITIONAL = {  # arguments of those that need some
     "budget": STORE,
     "fit": STORE,
@@ -39,10 +40,11 @@ def test_a_checkout_with_changes_is_refused_before_anything_is_measured(
     program = importlib.import_module(name)
 
     def refuse(root: object) -> None:
-        raise SystemExit(2)
+        raise SystemExit(REFUSED)
 
     monkeypatch.setattr(provenance, "clean_commit", refuse)
+    monkeypatch.setattr(program, "measure", lambda *_: pytest.fail("it measured"), raising=False)
     monkeypatch.setattr(sys, "argv", [f"{name}.py", *POSITIONAL.get(name, ())])
     with pytest.raises(SystemExit) as ended:
         program.main()
-    assert ended.value.code == 2
+    assert ended.value.code == REFUSED

@@ -60,7 +60,7 @@ def test_matches_of_a_pair_speak_for_both_cameras(wave: Capture, tmp_path: Path)
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
 
 
-def test_the_sheet_asks_once_for_outlines_and_draws_none_that_has_no_other(
+def test_the_sheet_asks_for_outlines_as_often_for_many_cameras_and_draws_none_that_has_no_other(
     wave: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the middle of the instants, which is shown, only one camera has an outline: nothing says how far it is off."""

@@ -23,7 +23,7 @@ def test_readable_values() -> None:
         "none",
         "a, 1",
     ]
-    assert [readable(v) for v in (9999.4, 12345.6)] == ["9999", "12346"]
+    assert [readable(v) for v in (9999.4, 9999.7, 12345.6)] == ["9999", "10000", "12346"]
     assert readable([[0.5, 2.0, 1.0]] * 5) == "15 values from 0.5 to 2"
 
 

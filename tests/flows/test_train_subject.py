@@ -4,6 +4,7 @@ import inspect
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -157,6 +158,24 @@ def test_hands_that_a_run_beside_it_found_are_not_shown(
     monkeypatch.setattr(module, "evaluate", linked)
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert {path.name for path in subject.iterdir() if path.is_symlink()} == set(store.STAGES) - store.OPTIONAL
+
+
+def test_hands_that_are_found_in_place_of_people_stay_linked(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An earlier run detected people; this one has the recording's keypoints, finds hands, and is interrupted."""
+    artifacts = store.Store(tmp_path / "store")
+
+    def hands(artifact_store: store.Store, *_: Any) -> Artifact:
+        artifact_store.link_latest("ada", artifact_store.get_or_compute("detection", "k", lambda out: {}))
+        return artifact_store.get_or_compute("hands", "k", lambda out: {})
+
+    monkeypatch.setattr(module, "with_detections", hands)
+    monkeypatch.setattr(module, "calibrate", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train_subject.fn(folder, "demo", tmp_path / "store", [])
+    linked = artifacts.subject_folder("ada")
+    assert {path.name for path in linked.iterdir() if path.is_symlink()} == {"capture", "hands"}
 
 
 def test_another_recording_of_the_same_name_is_said(

@@ -67,9 +67,9 @@ class BoardCalibration:
 def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> BoardCalibration:
     """Calibrate the cameras from the board footage in a folder's `calibration/`.
 
-    Intrinsics come from calibration/intrinsic/ where it fixes them, else from the folder's calibration files, else from
-    calibration/extrinsic/ itself. The world is the first camera, or the board as it lies in frame `ground_frame` (Z up,
-    origin at its top left corner). Raises InputError if the footage lacks what is needed.
+    Intrinsics come from calibration/intrinsic/ where it fixes them, else from the folder's calibration files, or, for a
+    camera with neither, from calibration/extrinsic/. The world is the first camera, or the board as it lies in frame
+    `ground_frame` (Z up, origin at its top left corner). Raises InputError if the footage lacks what is needed.
     """
     footage = read_board_footage(folder, "extrinsic", ground_frame)
     if footage is None:

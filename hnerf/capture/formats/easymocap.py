@@ -1,4 +1,5 @@
-"""The EasyMocap layout: intri.yml and extri.yml, images/ or videos/, openpose/, masks/ or mask/, background/."""
+"""The EasyMocap layout: intri.yml and extri.yml, images/ or videos/, openpose/ or pose/, masks/ or mask/,
+background/."""
 
 import re
 from collections.abc import Sequence
@@ -30,9 +31,8 @@ class EasyMocap(Layout):
 
     def footage(self, camera: str) -> Footage:
         """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""
-        files = safe_io.files_in(self.folder, "images", camera, suffixes=safe_io.IMAGE_SUFFIXES)
-        if files:
-            return ImageFolder(self.folder / "images" / camera, safe_io.numbered(files, "images"))
+        if images := self._images(camera):
+            return ImageFolder(self.folder / "images" / camera, images)
         video = safe_io.file_named(self.folder, camera, "videos", suffixes=safe_io.VIDEO_SUFFIXES)
         beside = safe_io.file_named(self.folder, camera, suffixes=safe_io.VIDEO_SUFFIXES)
         if not video.exists() and beside.exists():
@@ -45,9 +45,18 @@ class EasyMocap(Layout):
         return Video.open(video)
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return openpose/<camera>/<frame>_keypoints.json by frame, else pose/<camera>_json/*.json."""
-        files = safe_io.files_in(self.folder, "openpose", camera, suffixes=safe_io.JSON_SUFFIXES)
-        return dict(safe_io.numbered(files, "keypoints") or enumerate(pose_files(self.folder, camera)))
+        """Return openpose/<camera>/<frame>_keypoints.json by frame, else pose/<camera>_json/*.json, where Pose2Sim has
+        keypoints, one for each frame: in the order of the numbers in their names, walk_9 before walk_10."""
+        if own := safe_io.files_in(self.folder, "openpose", camera, suffixes=safe_io.JSON_SUFFIXES):
+            return dict(safe_io.numbered(own, "keypoints"))
+        found = safe_io.files_in(self.folder, "pose", f"{camera}_json", suffixes=safe_io.JSON_SUFFIXES)
+        images = sorted(self._images(camera))
+        numbers = images if len(images) == len(found) else range(len(found))
+        return dict(zip(numbers, sorted(found, key=_natural_order), strict=True))
+
+    def _images(self, camera: str) -> dict[int, Path]:
+        files = safe_io.files_in(self.folder, "images", camera, suffixes=safe_io.IMAGE_SUFFIXES)
+        return safe_io.numbered(files, "images")
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return masks/<camera>/<frame>.png, or mask/, by frame."""
@@ -65,14 +74,9 @@ class EasyMocap(Layout):
         return plate if plate.exists() else None
 
 
-def pose_files(folder: Path, camera: str) -> list[Path]:
-    """Return pose/<camera>_json/*.json, where Pose2Sim has keypoints, one for each video frame: in the order of the
-    numbers in their names, walk_9 before walk_10."""
-
-    def order(path: Path) -> list[str | int]:
-        return [int(part) if i % 2 else part for i, part in enumerate(re.split("([0-9]+)", path.stem))]
-
-    return sorted(safe_io.files_in(folder, "pose", f"{camera}_json", suffixes=safe_io.JSON_SUFFIXES), key=order)
+def _natural_order(path: Path) -> list[str | int]:
+    """Return a key that sorts walk_9 before walk_10."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split("([0-9]+)", path.stem))]
 
 
 def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:

@@ -6,17 +6,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from hnerf.capture.footage import Footage, Video
-from hnerf.capture.formats.easymocap import EasyMocap, pose_files
-from hnerf.capture.formats.layout import Layout, StoredFrame
+from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.lens import Lens, by_name, checked_lens
-from hnerf.capture.safe_io import VIDEO_SUFFIXES, file_named, files_in, read_toml
+from hnerf.capture.safe_io import files_in, read_toml
 from hnerf.errors import InputError
 
 
 @dataclass(frozen=True)
-class Pose2Sim(Layout):
-    """A capture folder as Pose2Sim's own tools read it: world to camera, metres, Z up."""
+class Pose2Sim(EasyMocap):
+    """A capture folder as Pose2Sim's own tools read it: world to camera, metres, Z up; and with what else EasyMocap has
+    in its folders."""
 
     mark = "calibration/Calib*.toml"
     novel_pose_share: ClassVar[float] = 0.2  # the last fifth, whose motion the training frames do not contain
@@ -28,15 +27,8 @@ class Pose2Sim(Layout):
             raise InputError(f"{self.folder / 'calibration'}: {len(files)} files Calib*.toml; leave exactly one")
         return lenses_from_tables(files[0], camera_tables(files[0]))
 
-    def footage(self, camera: str) -> Footage:
-        """Return videos/<camera>.mp4, or, where there is no folder videos/, images/<camera>/ or <camera>.mp4."""
-        if not (self.folder / "videos").is_dir():
-            return EasyMocap(self.folder).footage(camera)
-        return Video.open(file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES))
-
-    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return pose/<camera>_json/*.json by video frame."""
-        return dict(enumerate(pose_files(self.folder, camera)))
+    def _images(self, camera: str) -> dict[int, Path]:
+        return {} if (self.folder / "videos").is_dir() else super()._images(camera)
 
 
 def camera_tables(path: Path) -> dict[str, Any]:
@@ -73,5 +65,5 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
         raise InputError(f"{source}: camera {key[:80]}: {error} is missing; calibrate again") from None
     except (AttributeError, OverflowError, TypeError, ValueError):
         raise InputError(
-            f"{source}: camera {key[:80]}: its table, or a value in it, is not what it must be; calibrate again"
+            f"{source}: camera {key[:80]}: its table, or a value in it, has the wrong type or shape; calibrate again"
         ) from None

@@ -45,7 +45,7 @@ class Videos(EasyMocap):
         if self.folder.is_dir() and path_in_capture(self.folder, file.name).exists():
             given = read_intrinsics(file)
             if name not in given:
-                raise InputError(f"{file}: has no camera {name}; name it as the video is")
+                raise InputError(f"{file}: has no camera {name}; give video and camera one name")
             return {name: dataclasses.replace(given[name], R=CAMERA_FROM_Z_UP)}
         stated = read_manifest(self.folder).field_of_view_deg
         known = lens_by_angle(name, Video(videos[0], (0,), None), stated)

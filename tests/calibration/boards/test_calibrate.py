@@ -290,7 +290,7 @@ def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pyt
     calibration.save(tmp_path / "out")
     written = EasyMocap(tmp_path / "out").lenses()
     assert written["b"].t_m == pytest.approx(calibration.lenses["b"].t_m) and (tmp_path / "out" / "boards.png").exists()
-    calibration.save(tmp_path / "pose2sim", pose2sim=True)  # beside extri.yml the keypoints in pose/ are not read
+    calibration.save(tmp_path / "pose2sim", pose2sim=True)
     layout = recognise(tmp_path / "pose2sim")
     assert isinstance(layout, Pose2Sim)
     assert layout.lenses()["b"].t_m == pytest.approx(calibration.lenses["b"].t_m)

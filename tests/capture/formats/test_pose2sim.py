@@ -1,6 +1,7 @@
 """The real capture in the Pose2Sim layout."""
 
 import logging
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,24 @@ def test_keypoint_files_follow_the_numbers_in_their_names(tmp_path: Path) -> Non
         (folder / f"{name}.json").touch()
     files = Pose2Sim(tmp_path).keypoint_files("a")
     assert [Path(str(file)).stem for file in files.values()] == ["walk_9", "walk_10", "walk_\u0663", "\u0663"]
+
+
+def test_keypoints_go_with_numbered_images(tmp_path: Path) -> None:
+    """Images 3 to 12 and ten files of keypoints, numbered otherwise, and masks beside them."""
+    folder = rec.write_pose2sim(tmp_path / "walker")
+    for written in ("videos", "pose"):
+        shutil.rmtree(folder / written)
+    for camera in rec.CAMERAS:
+        for frame in range(3, 13):
+            rec.write_image(folder / "images" / f"cam{camera}" / f"{frame}.png", np.full((48, 64, 3), 9, np.uint8))
+            rec.write_image(folder / "masks" / f"cam{camera}" / f"{frame}.png", np.full((48, 64), 255, np.uint8))
+            person = np.tile([10.0 + frame, 20, 0.5], (25, 1))
+            rec.write_keypoints(folder / "pose" / f"cam{camera}_json" / f"k_{frame - 3}.json", [person])
+    found = ingest(folder, CaptureSettings(), tmp_path / "out")
+    keypoints = found.keypoints("cam01")
+    assert keypoints is not None and found.frames == tuple(range(3, 13))
+    assert keypoints[:, 0, 0, 0].tolist() == [10.0 + frame for frame in found.frames]
+    assert found.has_given_mask("cam01", 3)
 
 
 def test_keypoints_stay_where_another_calibration_takes_over(tmp_path: Path) -> None:

@@ -106,7 +106,9 @@ def test_what_is_known_of_a_lone_video_is_read(tmp_path: Path, caplog: pytest.Lo
     assert [mask is not None and bool(mask.all()) for mask in masks] == [False, True, False]
     assert plate is not None and (plate == 9).all()
     (folder / "videos" / "01.mp4").rename(folder / "videos" / "front.mp4")
-    assert refused(folder, tmp_path / "again").endswith("intri.yml: has no camera front; name it as the video is")
+    assert refused(folder, tmp_path / "again").endswith(
+        "intri.yml: has no camera front; give video and camera one name"
+    )
 
 
 def test_several_videos_need_cameras(tmp_path: Path) -> None:
