@@ -404,6 +404,21 @@ FAULTS = (
     Fault("cage-comes-on", "tasks/cage", "        _limit_processor_time(patience_s)\n        _send", "        _send"),
     Fault("cage-network", "tasks/cage", "    _give_up_network()\n    replies", "    replies"),
     Fault("cage-outlives", "tasks/cage", "    end_with_parent(signal.SIGKILL, parent)\n", ""),
+    # what reading the code line by line found
+    Fault("fit-split-runs", "body/observations", "changes != {frame}", "frame not in changes", seen_by="body/fit"),
+    Fault("clocks-middle", "calibration/clocks/keypoints", "(self.rate - rate) * self.middle_s", "0 * self.middle_s",
+          seen_by="calibration/clocks/clocks"),
+    Fault("clocks-counted", "capture/clocks", "4), _regular(times_s[name])))", "4),))"),
+    Fault("boards-gap", "calibration/boards/bundle", "MAX_APART = 1.5", "MAX_APART = 99.0",
+          seen_by="calibration/boards/calibrate"),
+    Fault("pose2sim-numbers", "capture/formats/easymocap",
+          "images if len(images) == len(found) else range(len(found))", "range(len(found))",
+          seen_by="capture/formats/pose2sim"),
+    Fault("lone-video-lens", "capture/formats/videos", "if self.folder.is_dir() and", "if False and"),
+    Fault("truth-of-training", "evaluation/ground_truth", "for c in self.capture.test_cameras for",
+          "for c in self.capture.cameras for", seen_by="evaluation/evaluate"),
+    Fault("bvh-root", "asset/bvh_file", "    offsets[0] = 0", "    offsets[0] = offsets[0]"),
+    Fault("garbage-damaged", "tasks/garbage", "record in lost or not", "not"),
 )  # fmt: skip
 
 
