@@ -15,13 +15,13 @@ from flows.display import display
 from flows.ending import Terminated, drop_what_is_left, open_closed_streams, unwound_by_sigterm
 from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
-from hnerf.errors import InputError, InvalidAsset
+from hnerf.errors import DISK_FULL, InputError, InvalidAsset
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
 from tasks.source import place
 
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143  # the last two as shells have them
-NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
+NO_ROOM = (None, *DISK_FULL, errno.EFBIG)  # None: our own, of libraries that do not say why
 CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # of hnerf.capture.formats.export, which is slow
 PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # of hnerf.render.subject, which imports torch
 SIZES_PX = (2, 8000)  # of a picture's side, of the same module

@@ -1,5 +1,8 @@
 """Exceptions that bad input raises."""
 
+import errno
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 MAX_MESSAGE = 2000  # characters; what a stranger's file says may be longer
 
 

@@ -3,7 +3,6 @@
 Objects must appear whole or not at all, as in object stores; on a local or mounted disk they are renamed into place.
 """
 
-import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,13 +15,12 @@ from fsspec.callbacks import Callback
 from fsspec.core import url_to_fs
 from fsspec.implementations.local import LocalFileSystem
 
-from hnerf.errors import InputError, PlaceError, one_line
+from hnerf.errors import DISK_FULL, InputError, PlaceError, one_line
 from hnerf.files import atomic_file
 from hnerf.progress import report
 
 VARIABLE = "HNERF_BUCKET"
 MAX_NOTE_BYTES = 1000
-FULL = (errno.ENOSPC, errno.EDQUOT)  # of a mounted bucket, or of this machine's disk
 
 
 @dataclass(frozen=True)
@@ -185,7 +183,7 @@ class Bucket:
         except PermissionError as error:
             raise PlaceError(f"{self.where(name)}: {one_line(error)}; allow this user to read and write it") from error
         except Exception as error:
-            full = isinstance(error, OSError) and error.errno in FULL
+            full = isinstance(error, OSError) and error.errno in DISK_FULL  # a mounted bucket, or this machine's disk
             advice = "make room" if full else "can the bucket be reached?"
             raise BucketError(f"{self.where(name)}: {one_line(error)}; {advice}") from error
 
