@@ -32,7 +32,7 @@ from hnerf.capture.manifest import (
     chosen_frames,
     read_manifest,
 )
-from hnerf.capture.normalise import Normaliser, kept_share
+from hnerf.capture.normalise import Normaliser, has_soft_edges, kept_share
 from hnerf.capture.safe_io import (
     IMAGE_SUFFIXES,
     JSON_SUFFIXES,
@@ -304,20 +304,26 @@ def _write_pixels(
             _check_distortion(footage.path, lens, (width_px, height_px))
             normaliser = Normaliser.create(lens, (width_px, height_px), settings.max_side_px)
         brightest = max(brightest, int(picture.rgb.max()))
-        stem = f"{picture.frame:06d}"
-        normaliser.write_image(picture.rgb, source, picture.file, out / "images" / lens.name / stem)
-        if picture.frame in mask_paths:
-            mask = mask_paths[picture.frame]
-            recorded = mask.read() if isinstance(mask, StoredFrame) else read_mask(mask)
-            path = mask.path if isinstance(mask, StoredFrame) else mask
-            normaliser.write_mask(recorded, path, out / "masks" / lens.name / f"{stem}.png")
+        normaliser.write_image(picture.rgb, source, picture.file, out / "images" / lens.name / f"{picture.frame:06d}")
     if brightest <= BLACK:
         raise InputError(f"{footage.path}: all pictures are black; record again, or leave camera {lens.name} out")
     assert normaliser is not None  # a split has at least one training frame
+    if mask_paths:
+        _write_masks(normaliser, mask_paths, out / "masks" / lens.name)
     plate = layout.plate_file(lens.name)
     if plate:
         normaliser.write_image(read_image(plate), plate, plate, out / "background" / lens.name)
     return normaliser
+
+
+def _write_masks(normaliser: Normaliser, masks: dict[int, Path | StoredFrame], out: Path, soft: bool = False) -> None:
+    """Write the masks of one camera, by frame; all of them again as soft where one has soft edges."""
+    for frame, mask in tracked(masks.items(), f"masks of camera {normaliser.lens.name}", len(masks)):
+        recorded = mask.read() if isinstance(mask, StoredFrame) else read_mask(mask)
+        path = mask.path if isinstance(mask, StoredFrame) else mask
+        if not soft and has_soft_edges(recorded, path):
+            return _write_masks(normaliser, masks, out, soft=True)
+        normaliser.write_mask(recorded, soft, path, out / f"{frame:06d}.png")
 
 
 def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> None:

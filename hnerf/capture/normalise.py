@@ -79,13 +79,12 @@ class Normaliser:
         else:
             write_image(target.with_name(f"{target.name}.jpg"), self.pixels(rgb))
 
-    def write_mask(self, recorded: np.ndarray, source: Path, target: Path) -> None:
+    def write_mask(self, recorded: np.ndarray, soft: bool, source: Path, target: Path) -> None:
         """Write a mask (H, W) uint8 from file `source` as 0/255 PNG.
 
-        The person is any level but black; in a matte, and in a JPEG, whose edges ring, any light level.
+        The person is any level but black; where the camera's masks have soft edges, any light level.
         """
         self._check_size(recorded, source)
-        soft = source.suffix.lower() in (".jpg", ".jpeg") or len(np.unique(recorded)) > MAX_LABELS
         black = 127 if soft else 0
         person = self.pixels(np.where(recorded > black, 255, 0).astype(np.uint8)) > 127
         write_image(target, np.where(person, 255, 0).astype(np.uint8))
@@ -98,6 +97,11 @@ class Normaliser:
                 f"{source}: is {width_px} x {height_px} px, but camera {self.lens.name} records "
                 f"{self.recorded_size_px[0]} x {self.recorded_size_px[1]}; all images of a camera must have one size"
             )
+
+
+def has_soft_edges(mask: np.ndarray, source: Path) -> bool:
+    """Return whether a mask (H, W) uint8 from file `source` is a matte, or comes from a JPEG, whose edges ring."""
+    return source.suffix.lower() in (".jpg", ".jpeg") or len(np.unique(mask)) > MAX_LABELS
 
 
 def kept_share(lens: Lens, size_px: tuple[int, int]) -> float:

@@ -189,18 +189,21 @@ def test_masks_in_a_jpeg_do_not_grow(folder: Path, tmp_path: Path) -> None:
 
 
 def test_mattes_are_cut_in_the_middle_of_their_edges_and_labels_are_not(folder: Path, tmp_path: Path) -> None:
-    """A matte has a ramp of 6 px beside the person, and 256 levels in another corner; label 1 is the person."""
+    """Camera 01 has mattes, with a ramp of 3 px beside the person: only one has more levels, in another corner. Camera
+    02 has labels, of which 1 is the person."""
     matte, labels = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8), np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
     matte[3:13, 5:19], labels[3:13, 5:19] = 255, 1
     matte[3:13, 19:22] = np.array([190, 120, 60])[:, None]
-    matte[13:] = np.linspace(0, 100, matte[13:, :, 0].size).reshape(matte.shape[0] - 13, -1)[..., None]
-    for camera in rec.CAMERAS:
-        for frame in rec.FRAMES:
-            write_image(folder / "masks" / camera / f"{frame:06d}.png", matte if frame == rec.FRAMES[0] else labels)
+    many = matte.copy()
+    many[13:] = np.linspace(0, 100, many[13:, :, 0].size).reshape(many.shape[0] - 13, -1)[..., None]
+    for frame in rec.FRAMES:
+        write_image(folder / "masks" / "01" / f"{frame:06d}.png", many if frame == 2 else matte)
+        write_image(folder / "masks" / "02" / f"{frame:06d}.png", labels)
     capture = ingest(folder, SETTINGS, tmp_path / "out")
-    soft, hard = (capture.given_mask("01", frame) for frame in rec.FRAMES[:2])
-    assert soft is not None and np.array_equal(soft, matte[..., 0] > 127)
-    assert hard is not None and np.array_equal(hard, labels[..., 0] > 0)
+    for frame in rec.FRAMES:
+        soft, hard = (capture.given_mask(camera, frame) for camera in rec.CAMERAS)
+        assert soft is not None and np.array_equal(soft, matte[..., 0] > 127)
+        assert hard is not None and np.array_equal(hard, labels[..., 0] > 0)
 
 
 def test_distorted_recording_comes_out_linear(folder: Path, tmp_path: Path) -> None:
