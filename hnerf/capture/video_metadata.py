@@ -33,9 +33,16 @@ def _of_image(path: Path) -> float | None:
 
 
 def _of_video(path: Path) -> float | None:
-    """Return the value of Apple's key in moov/meta (QuickTime File Format, "Metadata")."""
-    moov = top_box(path, b"moov", MAX_METADATA_BYTES)
-    meta = dict(boxes(moov)).get(b"meta", b"")
+    """Return the value of Apple's key in moov/meta, else in moov/trak/meta of the first track that has it (QuickTime
+    File Format, "Metadata")."""
+    movie = list(boxes(top_box(path, b"moov", MAX_METADATA_BYTES)))
+    tracks = [box for kind, content in movie if kind == b"trak" for box in boxes(content)]
+    found = (_stated(content) for kind, content in movie + tracks if kind == b"meta")
+    return next((value for value in found if value is not None), None)
+
+
+def _stated(meta: bytes) -> float | None:
+    """Return the value of Apple's key in a box of metadata."""
     parts = dict(boxes(meta)) or dict(boxes(meta[4:]))  # a full box in MP4, a plain one in QuickTime
     keys = parts.get(b"keys", b"")
     names = [content for _, content in boxes(keys[8:])]

@@ -47,11 +47,16 @@ def test_exif_gives_the_focal_length(tmp_path: Path) -> None:
     assert known.source == "26 mm, metadata"
 
 
-def test_a_videos_metadata_give_the_focal_length(tmp_path: Path) -> None:
+def apple_metadata(focal_mm: int) -> bytes:
+    """Return a box of metadata with two keys, the second of which is Apple's."""
     keys = box(b"keys", struct.pack(">II", 0, 2) + box(b"mdta", b"com.apple.quicktime.make") + box(b"mdta", KEY))
-    item = box(struct.pack(">I", 2), box(b"data", struct.pack(">IIh", 21, 0, 28)))
+    item = box(struct.pack(">I", 2), box(b"data", struct.pack(">IIh", 21, 0, focal_mm)))
+    return box(b"meta", keys + box(b"ilst", item))
+
+
+def test_a_videos_metadata_give_the_focal_length(tmp_path: Path) -> None:
     video = tmp_path / "a.mp4"
-    video.write_bytes(box(b"ftyp", b"qt  ") + box(b"moov", box(b"meta", keys + box(b"ilst", item))))
+    video.write_bytes(box(b"ftyp", b"qt  ") + box(b"moov", apple_metadata(28)))
     whole = video.read_bytes()
     assert focal_35mm(video) == 28
     video.write_bytes(whole[:-1])
@@ -59,6 +64,14 @@ def test_a_videos_metadata_give_the_focal_length(tmp_path: Path) -> None:
     start = whole.index(b"moov") - 4  # the last box may leave its size out, however much comes before
     video.write_bytes(box(b"free", bytes(MAX_METADATA_BYTES)) + whole[:start] + bytes(4) + whole[start + 4 :])
     assert focal_35mm(video) == 28
+
+
+def test_a_tracks_metadata_give_the_focal_length_where_the_movies_do_not(tmp_path: Path) -> None:
+    tracks = box(b"trak", box(b"tkhd", b"")) + box(b"trak", box(b"tkhd", b"") + apple_metadata(24))
+    video = tmp_path / "a.mov"
+    for movie, expected in ((b"", 24), (box(b"meta", b""), 24), (apple_metadata(28), 28)):
+        video.write_bytes(box(b"ftyp", b"qt  ") + box(b"moov", tracks + movie))
+        assert focal_35mm(video) == expected
 
 
 @pytest.mark.parametrize("name", ["intri.yml", "lenses.toml"])
