@@ -16,6 +16,7 @@ from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
+from hnerf.progress import tracked
 
 CAPTURED = "captured"  # the motion at the capture's own rate, whose time codes are the capture's frames
 RATES = (24, 30)  # frames a second that it is resampled at, since many importers ignore a file's rate
@@ -179,4 +180,6 @@ def _motions(
 
 
 def _boxes(rig: StagedRig, motion: str, rest: RestSurface) -> np.ndarray:
-    return np.stack([np.stack([points_m.min(0), points_m.max(0)]) for points_m in rig.surfaces_m(motion, rest)])
+    """Return the box (2, 3) of the surface at each time code of a motion, (n, 2, 3)."""
+    surfaces_m = tracked(rig.surfaces_m(motion, rest), f"boxes of {motion}", len(rig.stage[motion]))
+    return np.stack([np.stack([points_m.min(0), points_m.max(0)]) for points_m in surfaces_m])

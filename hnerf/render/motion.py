@@ -23,6 +23,7 @@ from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 from hnerf.geometry.rotations import slerp
+from hnerf.progress import tracked
 from hnerf.render.bvh_motion import bvh_motion
 
 AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, which share their first 22 joints
@@ -147,7 +148,8 @@ def set_middle_of_hips(body: BodyFit, points_m: Tensor) -> BodyFit:
 
 def lowest_points_m(body: BodyFit, up: str) -> Tensor:
     """Return the height (n,) of each pose's lowest vertex along the world's axis `up`."""
-    poses = zip(body.theta, body.root, strict=True)  # one at a time: all vertices at once would fill the memory
+    # One at a time: all vertices at once would fill the memory.
+    poses = tracked(zip(body.theta, body.root, strict=True), "lowest points", len(body.frames))
     return torch.stack([pose_vertices(body.rig, *pose)[:, "xyz".index(up)].min() for pose in poses])
 
 

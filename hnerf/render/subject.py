@@ -16,6 +16,7 @@ from hnerf.capture.timing import median_step
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 from hnerf.geometry.camera import Camera
+from hnerf.progress import tracked
 from hnerf.render.motion import Motion, interpolate_poses, read_motion, retarget, select_frames, select_poses
 from hnerf.render.pictures import Shot, write_pictures
 from hnerf.render.shape import transfer_poses, with_shape_values, with_volume
@@ -132,6 +133,7 @@ def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Ca
 
 def _middle_m(body: BodyFit) -> np.ndarray:
     """Return the centre (3,) of the box around all poses, in the world."""
-    poses = (pose_vertices(body.rig, *pose) for pose in zip(body.theta, body.root, strict=True))
-    corners_m = torch.stack([torch.stack([vertices_m.amin(0), vertices_m.amax(0)]) for vertices_m in poses])
+    poses = tracked(zip(body.theta, body.root, strict=True), "box of the motion", len(body.frames))
+    bodies_m = (pose_vertices(body.rig, *pose) for pose in poses)
+    corners_m = torch.stack([torch.stack([vertices_m.amin(0), vertices_m.amax(0)]) for vertices_m in bodies_m])
     return (corners_m[:, 0].amin(0) + corners_m[:, 1].amax(0)).double().numpy() / 2

@@ -9,6 +9,7 @@ from hnerf.asset.levels import Level
 from hnerf.asset.staging import StagedAvatar, moved_points, stage_avatar, stage_from_world
 from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
+from hnerf.progress import Progress, listening
 from tests.asset.figure import FRAMES, bending_body, column_rig
 
 LAYOUT = UvLayout(np.zeros((1, 2), np.float32), np.zeros((1, 3), np.int64))
@@ -79,6 +80,14 @@ def test_other_rates_are_the_same_motion_at_whole_frames(staged: StagedAvatar) -
     surfaces_m = list(staged.rigs["full"].surfaces_m("captured_30", staged.rest))
     for frame, true_m in zip(FRAMES, staged.points_m, strict=True):
         np.testing.assert_allclose(surfaces_m[3 * frame - 9], true_m, atol=1e-5)
+
+
+def test_how_far_the_boxes_of_a_long_motion_are_is_told() -> None:
+    heard: list[Progress] = []
+    with listening(heard.append):
+        staged = staged_without_shapes(bending_body())
+    counts = {name: len(boxes_m) for name, boxes_m in staged.extents_m.items()}
+    assert heard == [(f"boxes of {name}", done, count) for name, count in counts.items() for done in range(count + 1)]
 
 
 def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import joint_transforms
 from hnerf.errors import InputError
+from hnerf.progress import Progress, listening
 from hnerf.render.motion import (
     HIPS,
     Motion,
@@ -24,7 +25,7 @@ from hnerf.render.motion import (
     select_frames,
     select_poses,
 )
-from tests.asset.figure import bending_body, capture, column_rig
+from tests.asset.figure import FRAMES, bending_body, capture, column_rig
 
 
 def giant() -> BodyFit:
@@ -114,6 +115,14 @@ def test_single_frames_off_the_floor_do_not_move_a_motion() -> None:
     expected = torch.full((21,), 0.5)
     expected[7] = 0.4
     torch.testing.assert_close(lowest_points_m(retarget(own, Motion(other, 10.0, "z"), "z"), "z"), expected)
+
+
+def test_how_far_the_poses_of_a_long_motion_are_is_told() -> None:
+    heard: list[Progress] = []
+    with listening(heard.append):
+        lowest_points_m(bending_body(), "z")
+    count = len(FRAMES)
+    assert heard == [("lowest points", done, count) for done in range(count + 1)]
 
 
 def test_a_motion_without_a_joint_that_turns_is_refused() -> None:

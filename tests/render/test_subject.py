@@ -20,6 +20,7 @@ from hnerf.capture.footage import Video
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
 from hnerf.config import load_settings
+from hnerf.progress import Progress, listening
 from hnerf.render.motion import interpolate_poses
 from hnerf.render.subject import RenderOptions, _cameras
 from tests.training.scene import TINY, record
@@ -133,6 +134,13 @@ def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path
     along_recorded = _cameras(RenderOptions(path=subject / "calibration"), capture, body)
     assert not {camera.name for camera in along_recorded} & set(capture.cameras)
     assert {camera.name for camera in _cameras(RenderOptions(camera="2"), capture, body)} == {"2"}
+
+
+def test_how_far_the_box_of_a_long_motion_is_is_told(subject: Path) -> None:
+    heard: list[Progress] = []
+    with listening(heard.append):
+        _cameras(RenderOptions(), Capture.load(subject / "capture"), BodyFit.load(subject / "training"))
+    assert heard == [("box of the motion", done, 3) for done in range(4)]
 
 
 def test_interpolation_and_another_motion(subject: Path, tmp_path: Path) -> None:
