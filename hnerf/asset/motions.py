@@ -10,6 +10,8 @@ from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 from hnerf.geometry.rotations import slerp
 
+LEAST_TWIST = 0.5  # length of the twist's part of a quaternion: cos(60), where the up axis swings by 120 degrees
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -81,10 +83,14 @@ def ground_transforms(pelvis: np.ndarray, floor_m: float) -> np.ndarray:
     """Return the root's transforms (n, 4, 4): on the floor below the pelvis (n, 4, 4), turned as it about the vertical.
 
     That turn is the twist of the pelvis' rotation from rest about Y (swing-twist decomposition, Dobrowolski 2015).
+    Upside down a pelvis has none, and in a somersault it turns full circle on the way: there it is interpolated.
     """
     _, y, _, w = Rotation.from_matrix(pelvis[:, :3, :3]).as_quat().T
+    headings, known, rows = 2 * np.arctan2(y, w), np.hypot(y, w) >= LEAST_TWIST, np.arange(len(pelvis))
+    if known.any():
+        headings[~known] = np.interp(rows[~known], rows[known], np.unwrap(headings[known]))
     ground = np.tile(np.eye(4), (len(pelvis), 1, 1))
-    ground[:, :3, :3] = Rotation.from_euler("y", 2 * np.arctan2(y, w)[:, None]).as_matrix()
+    ground[:, :3, :3] = Rotation.from_euler("y", headings[:, None]).as_matrix()
     ground[:, :3, 3] = np.stack([pelvis[:, 0, 3], np.full(len(pelvis), floor_m), pelvis[:, 2, 3]], 1)
     return ground
 

@@ -46,6 +46,25 @@ def test_the_root_follows_way_and_heading_and_not_the_tilt() -> None:
     np.testing.assert_allclose(found[:3, :3], heading.as_matrix(), atol=1e-12)
 
 
+def test_the_root_does_not_spin_in_a_tilted_somersault() -> None:
+    """By angles a about an axis 10 degrees off the horizontal, the twist is 2 atan(sin 10 tan a/2): 33.5 degrees at
+    120, - 33.5 at 240, and all the way round by 180 between. Linear, it is 0 half way."""
+    angles, axis = np.radians(np.arange(0, 361, 12)), np.array([np.cos(np.radians(10)), np.sin(np.radians(10)), 0])
+    pelvis = np.tile(np.eye(4), (len(angles), 1, 1))
+    pelvis[:, :3, :3] = Rotation.from_rotvec(angles[:, None] * axis).as_matrix()
+    twists = np.degrees(2 * np.arctan(np.sin(np.radians(10)) * np.tan(angles / 2)))
+    twists[10:21] = np.linspace(33.48, -33.48, 11)
+    found = Rotation.from_matrix(ground_transforms(pelvis, 0)[:, :3, :3])
+    np.testing.assert_allclose(found.as_rotvec(degrees=True)[:, 1], twists, atol=0.01)
+
+
+def test_the_root_of_a_motion_that_is_upside_down_throughout_keeps_its_twist() -> None:
+    pelvis = np.eye(4)[None].copy()
+    pelvis[0, :3, :3] = Rotation.from_euler("yx", [50, 170], degrees=True).as_matrix()
+    found = Rotation.from_matrix(ground_transforms(pelvis, 0)[:, :3, :3])
+    np.testing.assert_allclose(found.as_rotvec(degrees=True), [[0, 50, 0]], atol=1e-6)
+
+
 def test_the_first_joint_turns_with_the_world_and_then_by_itself() -> None:
     """In a world with Y up the body is tipped by a quarter turn about x, and before that its first joint turns by one
     about z: the body's left, +X, goes to the world's Z; its front, -Y, to X."""
