@@ -62,7 +62,8 @@ def normals_and_distances(
     values at the corners of a tetrahedron, `step_m` from each point: the sum of the corners, weighted by the values
     there, and the mean of the values."""
     corners = TETRAHEDRON.to(points_m)
-    values_m = torch.stack([avatar.signed_distance(points_m + step_m * corner, theta, root) for corner in corners])
+    at_m = points_m + step_m * corners[:, None]  # (4, N, 3), asked for at once, since each call poses the body anew
+    values_m = avatar.signed_distance(at_m.flatten(0, 1), theta, root).view(at_m.shape[:2])
     return torch.nn.functional.normalize(values_m.T @ corners, dim=1), values_m.mean(0)
 
 

@@ -96,3 +96,17 @@ def test_normals_and_distances_by_hand() -> None:
         avatar: Any = SimpleNamespace(signed_distance=function)
         found = normals_and_distances(avatar, torch.tensor([point_m]), *pose, 0.5)
         torch.testing.assert_close(found, (torch.tensor([normal]), torch.tensor([distance_m])))
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_normals_pose_the_body_once(count: int) -> None:
+    asked: list[int] = []
+
+    def height(points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        asked.append(len(points_m))
+        return points_m[:, 2]
+
+    avatar: Any = SimpleNamespace(signed_distance=height)
+    normals, _ = normals_and_distances(avatar, torch.rand(count, 3), torch.zeros(1, 3), torch.eye(4), 0.5)
+    torch.testing.assert_close(normals, torch.tensor([0.0, 0, 1]).expand(count, 3))
+    assert asked == [4 * count]
