@@ -5,8 +5,9 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
+MYPY = "import gc; gc.disable(); gc.enable = int; from mypy.main import main; main()"  # a fifth of it is collection
 
 
 def test_types_agree() -> None:
-    found = subprocess.run([sys.executable, "-m", "mypy"], cwd=ROOT, capture_output=True, text=True, check=False)
+    found = subprocess.run([sys.executable, "-c", MYPY], cwd=ROOT, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stdout + found.stderr

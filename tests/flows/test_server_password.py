@@ -9,7 +9,6 @@ from pathlib import Path
 
 import httpx
 import pytest
-from prefect.server.api.server import create_app
 from prefect.settings import PREFECT_SERVER_API_AUTH_STRING, PREFECT_SERVER_CORS_ALLOWED_ORIGINS, temporary_settings
 
 from flows.server_password import NAMES, environment
@@ -20,6 +19,8 @@ PATH = "/api/admin/version"
 
 def ask(method: str, headers: dict[str, str], auth: tuple[str, str] | None = None) -> httpx.Response:
     """Return the answer of a server with the origins of prefect.toml and a password, without starting one."""
+    from prefect.server.api.server import create_app  # takes seconds, which only the worker that asks should spend
+
     settings = tomllib.loads((ROOT / "prefect.toml").read_text())
     origins = settings["server"]["api"]["cors_allowed_origins"]
 
