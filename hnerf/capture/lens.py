@@ -24,7 +24,8 @@ class Lens:
     """A calibrated camera with lens distortion: K (3, 3) pixels; distortion (4,) or (5,), OpenCV's k1 k2 p1 p2 [k3]; R
     (3, 3), t_m (3,) world to camera.
 
-    `size_px` is the (width, height) that was calibrated, None where the file does not say.
+    `size_px` is the (width, height) that was calibrated, None where the file does not say; `estimated`: whether
+    K comes from an angle or from the person, not from a file of intrinsics.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Lens:
     R: np.ndarray
     t_m: np.ndarray
     size_px: tuple[int, int] | None
+    estimated: bool = False
 
 
 def pinhole(camera: Camera) -> Lens:
@@ -91,6 +93,7 @@ def checked_lens(
     R: np.ndarray,
     t_m: np.ndarray,
     size_px: tuple[float, float] | None,
+    estimated: bool = False,
 ) -> Lens:
     """Return a Lens from numbers of any shape. Raises InputError naming file and camera if they are not a camera.
 
@@ -121,4 +124,4 @@ def checked_lens(
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError(f"{extrinsics}: camera {camera}: R is not a rotation; calibrate again")
     size = check_image_size(intrinsics, *size_px) if size_px else None
-    return Lens(camera, K, distortion.ravel(), R, t_m.ravel(), size)
+    return Lens(camera, K, distortion.ravel(), R, t_m.ravel(), size, estimated)

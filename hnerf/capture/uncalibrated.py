@@ -61,12 +61,14 @@ class Uncalibrated(Layout):
 
     @cached_property
     def known_lenses(self) -> dict[str, KnownLens]:
-        """Return what is known of each camera's lens: from the lens file, the field of view, the metadata of images or
-        videos, in this order, or a guess. Raises InputError where a file cannot be read."""
+        """Return what is known of each camera's lens: from the lens file, or what `intri.yml` has that an earlier
+        calibration did not estimate, the field of view, the metadata of images or videos, in this order, or a guess.
+        Raises InputError where a file cannot be read."""
         names = [name for name in cameras_without_calibration(self.folder) if self.only in (None, name)]
         own = path_in_capture(self.folder, "intri.yml")
         file = self.lens_file or (own if own.exists() else None)
-        given = read_lenses(file) if file else {}
+        read = read_lenses(file) if file else {}
+        given = {name: lens for name, lens in read.items() if self.lens_file or not lens.estimated}
         if self.lens_file and not set(given).intersection(names):
             raise InputError(f"{file}: has none of the cameras {', '.join(names)}; name them as the recordings are")
         known = {name: KnownLens(lens, f"from {file.name}") for name, lens in given.items() if file and name in names}
@@ -109,7 +111,7 @@ def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLe
         focal_px = equivalent_mm / DIAGONAL_35MM * np.hypot(width_px, height_px)
         source = f"{equivalent_mm:g} mm, metadata"
     K = np.array([[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]])
-    return KnownLens(Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px)), source)
+    return KnownLens(Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px), True), source)
 
 
 def read_lenses(path: Path) -> dict[str, Lens]:

@@ -3,13 +3,16 @@
 import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from hnerf.capture.capture import SubjectPoint, write_image
 from hnerf.capture.footage import Video
+from hnerf.capture.formats import easymocap
 from hnerf.capture.ingest import ingest, recognise
+from hnerf.capture.lens import Lens
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.capture.video_metadata import KEY, MAX_METADATA_BYTES, focal_35mm
 from hnerf.config import CaptureSettings
@@ -86,6 +89,18 @@ def test_a_lens_file_comes_first(tmp_path: Path, name: str) -> None:
     known = Uncalibrated(tmp_path, file, 90).known_lenses
     assert known["a"].lens.K[0].tolist() == [150, 0, 99] and known["a"].source == f"from {name}"
     assert known["a"].lens.t_m.tolist() == [0, 0, 0] and known["b"].source == "90 degrees given"
+
+
+def test_a_lens_that_a_calibration_estimated_is_not_given_unless_it_is_named(tmp_path: Path) -> None:
+    for camera in "ab":
+        write_images(tmp_path, camera)
+    K, here = np.array([[150.0, 0, 99], [0, 150, 49], [0, 0, 1]]), (np.zeros(4), np.eye(3), np.zeros(3), (200, 100))
+    easymocap.write_easymocap(tmp_path, [Lens("a", K, *here), Lens("b", K, *here, estimated=True)])
+    assert [known.source for known in Uncalibrated(tmp_path).known_lenses.values()] == ["from intri.yml", ""]
+    named = Uncalibrated(tmp_path, tmp_path / "intri.yml").known_lenses
+    assert [known.source for known in named.values()] == ["from intri.yml"] * 2
+    intri = cv2.FileStorage(str(tmp_path / "intri.yml"), cv2.FILE_STORAGE_READ)  # as EasyMocap reads it
+    assert intri.getNode("K_b").mat()[0, 0] == 150
 
 
 def test_a_lens_file_of_other_cameras_is_refused(tmp_path: Path) -> None:

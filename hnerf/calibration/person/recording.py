@@ -1,5 +1,6 @@
 """Calibration from the person in a folder of images or videos: ingestion, keypoints, cameras."""
 
+import dataclasses
 import tempfile
 from pathlib import Path
 
@@ -16,8 +17,9 @@ def calibrate_recording(
 ) -> PersonCalibration:
     """Calibrate the cameras of a recording from its own keypoints, or from those of the network where it has none.
 
-    A calibration that the folder may have is not read, but for the intrinsics of its `intri.yml`. Raises InputError
-    where the recording cannot be read or does not determine the cameras.
+    A calibration that the folder may have is not read, but for the intrinsics of its `intri.yml` that no earlier
+    calibration from the person wrote there. Raises InputError where the recording cannot be read or does not determine
+    the cameras.
     """
     if not cameras_without_calibration(folder):
         raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to calibrate from; add the recordings")
@@ -25,6 +27,9 @@ def calibrate_recording(
     with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
         capture = ingest(folder, CaptureSettings(), Path(scratch) / "capture", layout)
         capture = with_keypoints(capture, Path(scratch) / "detected")
-        sources = {name: known.source for name, known in layout.known_lenses.items()}
+        known = layout.known_lenses
+        sources = {name: one.source for name, one in known.items()}
         unknown = [name for name, source in sources.items() if not source]
-        return calibrate_from_person(capture, unknown, sources, height_m or capture.stature_m)
+        found = calibrate_from_person(capture, unknown, sources, height_m or capture.stature_m)
+    lenses = [dataclasses.replace(lens, estimated=known[lens.name].lens.estimated) for lens in found.lenses]
+    return dataclasses.replace(found, lenses=lenses)

@@ -87,6 +87,8 @@ def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:
         intri += _matrix(f"K_{lens.name}", lens.K) + _matrix(f"dist_{lens.name}", lens.distortion[None])
         if lens.size_px:
             intri += f"W_{lens.name}: {lens.size_px[0]}\nH_{lens.name}: {lens.size_px[1]}\n"
+        if lens.estimated:
+            intri += f"estimated_{lens.name}: 1\n"
         extri += _matrix(f"R_{lens.name}", cv2.Rodrigues(lens.R)[0]) + _matrix(f"Rot_{lens.name}", lens.R)
         extri += _matrix(f"T_{lens.name}", lens.t_m[:, None])
     (out / "intri.yml").write_text(intri, encoding="utf-8")
@@ -187,4 +189,5 @@ def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None, ro
         R=extri.required(*(f"{kind}_{name}" for kind in rotations)) if extri else np.eye(3),
         t_m=extri.required(f"T_{name}") if extri else np.zeros(3),
         size_px=(width_px, height_px) if width_px is not None and height_px is not None else None,
+        estimated=intri.number(f"estimated_{name}") == 1,
     )

@@ -70,6 +70,8 @@ def test_a_folder_gets_its_cameras(
     assert json.loads((out / "report.json").read_text())["cameras"]["c0"]["uncertainty"]["move_m"] < 0.1
     shutil.copytree(out, folder, dirs_exist_ok=True)  # as the command says, to use them
     assert ingest(folder, CaptureSettings(), tmp_path / "ingested").has_keypoints
+    again = Uncalibrated(folder, fov_deg=float(fov_deg))  # the same command does the same again
+    assert {known.source for known in again.known_lenses.values()} == {"53.1301 degrees given"}
 
 
 def test_a_field_of_view_beside_the_lenses_of_all_cameras_is_refused(tmp_path: Path) -> None:
