@@ -153,9 +153,12 @@ def _parser() -> argparse.ArgumentParser:
     add(commands.check_cameras, capture, preset)
     add(commands.settings, preset)
 
-    _add_calibrate(add(commands.calibrate))
-    add(commands.synchronise).add_argument("folder", type=Path, help="capture whose cameras did not start together")
-    cameras = add(commands.export_cameras)
+    caged = argparse.ArgumentParser(add_help=False)
+    _add_overrides(caged, "override a setting under `limits.`")
+    _add_calibrate(add(commands.calibrate, caged))
+    synchronise = add(commands.synchronise, caged)
+    synchronise.add_argument("folder", type=Path, help="capture whose cameras did not start together")
+    cameras = add(commands.export_cameras, caged)
     cameras.add_argument(
         "folder", type=Path, help="capture folder, what `hnerf calibrate` wrote, or <store>/subjects/<name>/calibration"
     )

@@ -6,13 +6,13 @@ Each imports what it needs itself, so that the others, and help, need not wait f
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from flows.settings_list import settings_list
-from hnerf.config import SyntheticSettings, load_settings, overridden
+from hnerf.config import Settings, SyntheticSettings, load_settings, overridden
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 
@@ -107,11 +107,9 @@ def calibrate(options: argparse.Namespace) -> None:
             raise InputError(
                 f"{option}: has no effect with --from {options.source}; leave it out, or give --from {other}"
             )
-    from tasks.cage import run_caged
-
     source = _calibrate_from_person if options.source == "person" else _calibrate_from_boards
     with atomic_folder(options.out) as partial:
-        run_caged(source, options, partial, folder=options.folder)
+        _read_in_cage(source, options, partial)
 
 
 def _calibrate_from_boards(options: argparse.Namespace, out: Path) -> None:
@@ -152,16 +150,14 @@ def synchronise(options: argparse.Namespace) -> None:
     path = options.folder / FILE
     if path.exists():
         raise InputError(f"{path}: exists; remove it to synchronise again")
-    from tasks.cage import run_caged
-
-    run_caged(_synchronise, options.folder, path, folder=options.folder)
+    _read_in_cage(_synchronise, options, path)
 
 
-def _synchronise(folder: Path, path: Path) -> None:
+def _synchronise(options: argparse.Namespace, path: Path) -> None:
     from hnerf.calibration.clocks.recording import synchronise_recording
     from hnerf.capture.clocks import write_clocks
 
-    found, sources = synchronise_recording(folder)
+    found, sources = synchronise_recording(options.folder)
     write_clocks(path, found.clocks)
     print(f"{'camera':<12} {'offset s':>9} {'+- ms':>6} {'drift ppm':>9}  from")
     for name, clock in found.clocks.items():
@@ -176,10 +172,8 @@ def export_cameras(options: argparse.Namespace) -> None:
     """Write the cameras of a capture in the format of another tool."""
     if options.folder.resolve() in options.out.resolve().parents:
         raise InputError(f"{options.out}: lies in the recording, whose results would be computed again; give another")
-    from tasks.cage import run_caged
-
     with atomic_folder(options.out) as partial:
-        run_caged(_export_cameras, options, partial, folder=options.folder)
+        _read_in_cage(_export_cameras, options, partial)
     print(f"cameras: {options.out}")
 
 
@@ -188,6 +182,25 @@ def _export_cameras(options: argparse.Namespace, out: Path) -> None:
     from hnerf.capture.ingest import exported_lenses
 
     write_cameras(out, exported_lenses(options.folder), options.format)
+
+
+def _read_in_cage(read: Callable[[argparse.Namespace, Path], None], options: argparse.Namespace, out: Path) -> None:
+    """Call `read(options, out)` in a process of its own, with the limits that the options set."""
+    from tasks.cage import run_caged
+    from tasks.limits import set_limits
+
+    _check_section(options, "limits")
+    set_limits(overridden(Settings(), options.overrides).limits)
+    run_caged(read, options, out, folder=options.folder)
+
+
+def _check_section(options: argparse.Namespace, section: str) -> None:
+    """Raise InputError for a setting of another section."""
+    for override in options.overrides:
+        if override.partition("=")[0].split(".")[0] != section:
+            raise InputError(
+                f"--set {override}: this command takes settings of the section `{section}` only; remove it"
+            )
 
 
 def benchmark(options: argparse.Namespace) -> None:
@@ -245,9 +258,7 @@ def render(options: argparse.Namespace) -> None:
 
 def export(options: argparse.Namespace) -> None:
     """Export the asset of a trained person again, with other settings or more motions."""
-    for override in options.overrides:
-        if override.partition("=")[0].split(".")[0] != "asset":
-            raise InputError(f"--set {override}: hnerf export takes settings of the section `asset` only; remove it")
+    _check_section(options, "asset")
     from hnerf.asset.subject import export_subject
     from tasks.store import recording_digest, require_intact
 

@@ -19,7 +19,7 @@ from hnerf.render.subject import MAX_SIZE_PX, MIN_SIZE_PX, OUTPUT_KINDS
 from hnerf.render.subject import ORBIT_PICTURES as PICTURES_OF_AN_ORBIT
 from tasks.bucket import BucketError
 from tasks.launcher import LostWorkerError, RankFailedError
-from tasks.limits import StalledError
+from tasks.limits import StalledError, current_limits
 from tests.capture.recordings import write_easymocap
 from tests.shared_data import shared_capture
 
@@ -50,7 +50,11 @@ from tests.shared_data import shared_capture
         ),
         (
             ["export", ".", "--set", "training.steps=3"],
-            "hnerf: --set training.steps=3: hnerf export takes settings of the section `asset` only; remove it",
+            "hnerf: --set training.steps=3: this command takes settings of the section `asset` only; remove it",
+        ),
+        (
+            ["synchronise", ".", "--set", "asset.bones=along"],
+            "hnerf: --set asset.bones=along: this command takes settings of the section `limits` only; remove it",
         ),
         (
             ["run", "http://example.com/x.mp4"],
@@ -126,6 +130,17 @@ def test_a_full_disk_is_one_line_and_exit_code_1(
         assert main(["run", str(tmp_path)]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line == f"hnerf: {error}; make room and give the same command again"
+
+
+def test_the_memory_of_commands_that_read_a_recording_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As is advised where it is too little."""
+    found = []
+    monkeypatch.setattr("tasks.cage.run_caged", lambda *_, **__: found.append(current_limits().reader_gib))
+    for command in (["calibrate"], ["synchronise"], ["export-cameras", "--format", "colmap"]):
+        where = [] if command == ["synchronise"] else ["--out", str(tmp_path / command[0])]
+        (tmp_path / "ada").mkdir(exist_ok=True)
+        assert main([*command, str(tmp_path / "ada"), *where, "--set", "limits.reader_gib=20"]) == 0
+    assert found == [20, 20, 20]
 
 
 def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
