@@ -6,6 +6,7 @@ record away first, and puts it back if its time has changed since it was read: e
 use is seen here.
 """
 
+import fcntl
 import os
 import re
 import time
@@ -39,7 +40,7 @@ class Garbage:
 
 def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbage]:
     """Return what the `keep` newest results of no subject need, what was left by work that was interrupted, and what
-    cannot be found any more, as far as nobody has used it for `older_s` seconds."""
+    cannot be found any more, as far as nobody has used it for `older_s` seconds or works on it now."""
     needed = inventory.needed(keep)
     found = [
         Garbage(one.artifact.stage, one.artifact.root.name, (), one.size_bytes, one.used_s)
@@ -47,7 +48,8 @@ def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbag
         if name not in needed
     ]
     found += _left_behind(inventory)
-    return [one for one in found if one.used_s <= time.time() - older_s]
+    old = [one for one in found if one.used_s <= time.time() - older_s]
+    return [one for one in old if not _is_locked(inventory.store.path(one.stage, one.key, ".lock"))]
 
 
 def collect(store: Store, garbage: Garbage) -> bool:
@@ -84,6 +86,18 @@ def _remove_left(store: Store, garbage: Garbage) -> bool:
         elif path.suffix != ".lock":  # that one is held, and goes last (Store.locked)
             path.unlink(missing_ok=True)
     return True
+
+
+def _is_locked(lock: Path) -> bool:
+    """Return whether a process holds a lock, as whoever works on its key does; the lock is left as it is."""
+    if lock.is_symlink() or not lock.is_file():
+        return False
+    with suppress(OSError), lock.open() as file:  # removed meanwhile, or not to be read
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def _can_be_found(store: Store, garbage: Garbage) -> bool:

@@ -127,10 +127,11 @@ def test_unfinished_work_goes_unless_somebody_is_at_it(store: Store) -> None:
     (fit / f"{93:032x}.lock").touch()
     (fit / f"{94:032x}.json.partial").symlink_to(store.root / "subjects")
     (fit / "notes.txt").touch()
+    found = find_garbage(Inventory.of(store), 1, 0)
+    assert {one.key for one in found} == {f"{n:032x}" for n in (90, 91, 92, 93, 94)}
     with (fit / f"{91:032x}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        found = find_garbage(Inventory.of(store), 1, 0)
-        assert {one.key for one in found} == {f"{n:032x}" for n in (90, 91, 92, 93, 94)}
+        assert garbage(store) == {f"fit/{n:032x}" for n in (90, 92, 93, 94)}
         assert {one.key for one in found if not collect(store, one)} == {f"{91:032x}"}
         lock.flush()
     left = {path.name for path in fit.iterdir()} - {f"{n:032x}{e}" for n in (11, 12) for e in ("", ".json", ".lock")}
