@@ -19,7 +19,8 @@ class NotApplicableError(InputError):
 
 
 class PlaceError(InputError):
-    """A place of results that is away, closed or full: no fault of the recording, and no result of a study."""
+    """A place of results that is away, closed or full, or a machine with too few GPUs: no fault of the recording, and
+    no result of a study; unfinished work stays."""
 
 
 class InvalidAsset(Exception):

@@ -33,7 +33,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field, FiniteFloat
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 from hnerf.files import atomic_file, made_folder, replace_text
 from tasks.pins import pin, unless_read_only
 
@@ -165,7 +165,7 @@ class Store:
             try:
                 metrics = write(partial)
             except BaseException as error:
-                if not resumable or isinstance(error, InputError):
+                if not resumable or (isinstance(error, InputError) and not isinstance(error, PlaceError)):
                     remove(partial)
                 raise
             finite = {name: value for name, value in metrics.items() if math.isfinite(value)}  # JSON has no others

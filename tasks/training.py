@@ -8,6 +8,7 @@ import torch
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings
+from hnerf.errors import PlaceError
 from hnerf.training.checkpoint import NAME
 from tasks.launcher import run_ranks
 from tasks.stage import stage
@@ -25,7 +26,13 @@ def train(
 ) -> dict[str, float]:
     """Train on one GPU a process; resume from the checkpoint of an interrupted run."""
     inputs = [str(artifact.root) for artifact in (recording, calibration, segmentation, body)]
-    processes = settings.processes or max(1, torch.cuda.device_count())
+    gpus = torch.cuda.device_count()
+    if 0 < gpus < settings.processes:
+        raise PlaceError(
+            f"training.processes={settings.processes}: each process needs a GPU, and this machine has {gpus}; "
+            "lower it, or leave it out"
+        )
+    processes = settings.processes or max(1, gpus)
     run_ranks("hnerf.training.run", [*inputs, settings.model_dump_json(), str(out)], processes)
     report = json.loads((out / "report.json").read_text())
     return {name: report[name] for name in ("steps", "seconds", "peak_memory_gib", "model_mib")}

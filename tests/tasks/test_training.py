@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.config import TrainingSettings
+from hnerf.errors import InputError
 from tasks import training as module
 from tasks.store import Artifact, Store
 
@@ -26,6 +27,12 @@ def test_the_checkpoint_is_there_until_the_ranks_are_done_and_never_in_the_artif
     given = Artifact(stage="capture", root=tmp_path, files={})
     with pytest.raises(OSError, match="lost"):
         module.train(Store(tmp_path), given, given, given, given, TrainingSettings())
+    with monkeypatch.context() as one_gpu:  # whoever asks for two loses nothing
+        one_gpu.setattr("torch.cuda.device_count", lambda: 1)
+        with pytest.raises(
+            InputError, match=r"^training\.processes=2: each process needs a GPU, and this machine has 1;"
+        ):
+            module.train(Store(tmp_path), given, given, given, given, TrainingSettings(processes=2))
     made = module.train(Store(tmp_path), given, given, given, given, TrainingSettings())
     assert found == [[], ["checkpoint.pt", "checkpoint.pt.tmp", "report.json"]]
     assert list(made.files) == ["report.json"] == [path.name for path in made.root.iterdir()]
