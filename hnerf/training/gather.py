@@ -105,7 +105,7 @@ def _write_pixels(
             columns.append("edge", edges[-1])
             columns.append("image_camera", [c])
             columns.close("image_starts", len(edges[-1]))
-            if plates:
+            if plates and wanted.any():
                 window = bounding_window(wanted)
                 shaded = shaded_plate(mask[window], image[window], plates[c].colour[window])[wanted[window]]
                 columns.append("plate", _exposure_corrected(shaded.clip(0, 255).round().astype(np.uint8), gain))

@@ -100,6 +100,19 @@ def test_pixels_that_have_no_room_leave_it_to_others(tmp_path: Path, monkeypatch
     assert not any((tmp_path / "out").iterdir())
 
 
+def test_an_image_that_shows_nothing_of_the_person_has_no_pixels(tmp_path: Path) -> None:
+    capture, masks, body = record(tmp_path)
+    masks.encoded["1", 0] = encode(np.zeros((SIZE_PX, SIZE_PX), bool))
+
+    def reached(camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+        left = camera.name == "1" and np.array_equal(vertices_m, body.vertices_m()[0])
+        return REACHED(camera, vertices_m) & (not left)
+
+    pixels = gather_pixels(capture, masks, body, body.frames, reached, {}, tmp_path, ALONE)
+    assert pixels.plate is not None and pixels.plate.shape == pixels.colour.shape
+    assert int(pixels.image_starts.diff()[1]) == 0 < int(pixels.image_starts.diff()[2])
+
+
 def test_an_outline_before_an_unknown_background_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one camera nothing is known: its outlines are gone, its other pixels and the other cameras' outlines are
     not."""
