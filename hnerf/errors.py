@@ -3,6 +3,7 @@
 import errno
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+REASON = "hnerf: "  # begins the line on standard error that says why a process ends
 MAX_MESSAGE = 2000  # characters; what a stranger's file says may be longer
 
 

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 
-from hnerf.errors import InputError
+from hnerf.errors import REASON, InputError
 from hnerf.processes import end_with_parent
 from hnerf.progress import report_relayed
 
@@ -44,7 +44,7 @@ def _os_error(message: str) -> OSError:
     return OSError(why) if number is None else OSError(number, why, name)
 
 
-# Exceptions for exit codes of ranks whose last line on stderr is the reason.
+# Exceptions for exit codes of ranks that say the reason in a line on stderr; libraries may say more at exit.
 ERROR_BY_EXIT_CODE: dict[int, Callable[[str], Exception]] = {2: InputError, 3: RankFailedError, 4: _os_error}
 
 
@@ -130,10 +130,11 @@ def _error(module: str, logs: Path, ended: int) -> Exception:
         return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(logs / FAILURE))
     rank, code = json.loads(report)
     written = [path.read_text(errors="replace") for path in logs.glob(f"*/attempt_0/{rank}/stderr.log")]
-    lines = "".join(written).strip().splitlines()[-LAST_LINES:]
-    if code in ERROR_BY_EXIT_CODE and lines:
-        return ERROR_BY_EXIT_CODE[code](lines[-1])
+    lines = "".join(written).strip().splitlines()
+    reasons = [line.removeprefix(REASON) for line in lines if line.startswith(REASON)]
+    if code in ERROR_BY_EXIT_CODE and reasons:
+        return ERROR_BY_EXIT_CODE[code](reasons[-1])
     if -code in KILLED:
         return LostWorkerError(f"{module}: rank {rank} was killed by {signal.Signals(-code).name}")
     how = f"crashed with {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-    return RuntimeError("\n".join([f"{module}: rank {rank} {how}", *lines]))
+    return RuntimeError("\n".join([f"{module}: rank {rank} {how}", *lines[-LAST_LINES:]]))

@@ -17,15 +17,15 @@ from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
-from hnerf.errors import InputError, one_line
+from hnerf.errors import REASON, InputError, one_line
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import train
 
 
 def main() -> int:
-    """Train; return 0, or print one line on standard error and return 2 for bad input, 3 for a training that cannot go
-    on, 4 for failed input or output, as JSON: errno, its meaning, file."""
+    """Train; return 0, or print one line that begins with REASON on standard error and return 2 for bad input, 3 for a
+    training that cannot go on, 4 for failed input or output, as JSON: errno, its meaning, file."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name in ("capture", "calibration", "masks", "fit"):
         parser.add_argument(name, type=Path)
@@ -39,15 +39,14 @@ def main() -> int:
         settings = TrainingSettings.model_validate_json(a.settings)
         train(capture, Masks.load(a.masks), BodyFit.load(a.fit), settings, a.out, processes)
     except InputError as error:
-        print(error, file=sys.stderr)
+        print(f"{REASON}{error}", file=sys.stderr)
         return 2
     except TrainingError as error:
-        print(error, file=sys.stderr)
+        print(f"{REASON}{error}", file=sys.stderr)
         return 3
     except OSError as error:
-        print(
-            json.dumps([error.errno, error.strerror or one_line(error), error.filename], default=str), file=sys.stderr
-        )
+        told = json.dumps([error.errno, error.strerror or one_line(error), error.filename], default=str)
+        print(f"{REASON}{told}", file=sys.stderr)
         return 4
     finally:
         progress.report("training", 1, 1)  # ended, however

@@ -14,7 +14,7 @@ def main(mode: str, folder: Path) -> None:
     rank = int(os.environ["RANK"])
     (folder / str(os.getpid())).touch()
     if rank == 1 and mode == "bad":
-        print("a warning\na.jpg: bad; write it again", file=sys.stderr)
+        print("a warning\nhnerf: a.jpg: bad; write it again\na warning at exit", file=sys.stderr)
         sys.exit(2)
     if rank == 1 and mode == "killed":
         os.kill(os.getpid(), signal.SIGKILL)

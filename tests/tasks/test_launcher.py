@@ -92,23 +92,28 @@ def test_one_failing_rank_ends_all_with_its_message(
 
 
 @pytest.mark.parametrize(
-    ("code", "last_line", "error", "message"),
+    ("code", "line", "error", "message"),
     [
         (1, "ValueError: boom", RuntimeError, "^ranks: rank 1 ended with exit code 1\na warning\nValueError: boom$"),
-        (2, "a.jpg: bad; write it again", InputError, r"^a\.jpg: bad; write it again$"),
-        (3, "no surface: check the masks", RankFailedError, "^no surface: check the masks$"),
-        (4, '[28, "No space left on device", "b.pt"]', OSError, r"^\[Errno 28\] No space left on device: 'b\.pt'$"),
+        (2, "hnerf: a.jpg: bad; write it again\nat exit", InputError, r"^a\.jpg: bad; write it again$"),
+        (3, "hnerf: no surface: check the masks", RankFailedError, "^no surface: check the masks$"),
+        (
+            4,
+            'hnerf: [28, "No space left on device", "b.pt"]',
+            OSError,
+            r"^\[Errno 28\] No space left on device: 'b\.pt'$",
+        ),
         (-signal.SIGTERM, "stopped", LostWorkerError, "^ranks: rank 1 was killed by SIGTERM$"),
         (-signal.SIGSEGV, "oh", RuntimeError, "^ranks: rank 1 crashed with SIGSEGV\na warning\noh$"),
     ],
 )
 def test_the_first_failure_of_torchrun_by_exit_code(
-    tmp_path: Path, code: int, last_line: str, error: type[Exception], message: str
+    tmp_path: Path, code: int, line: str, error: type[Exception], message: str
 ) -> None:
     (tmp_path / launcher.FAILURE).write_text(json.dumps([1, code]))
     written = tmp_path / "run" / "attempt_0" / "1" / "stderr.log"
     written.parent.mkdir(parents=True)
-    written.write_text(f"a warning\n{last_line}\n")
+    written.write_text(f"a warning\n{line}\n")
     found = launcher._error("ranks", tmp_path, 1)
     assert type(found) is error and re.search(message, str(found))
 

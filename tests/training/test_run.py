@@ -20,11 +20,11 @@ from hnerf.training.step import TrainingError
         (OSError("c.png: cannot be written"), 4, '[null, "c.png: cannot be written", null]'),
     ],
 )
-def test_what_is_told_is_the_last_line_and_an_exit_code(
+def test_what_is_told_is_a_marked_line_and_an_exit_code(
     error: Exception, code: int, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["run", "capture", "cameras", "masks", "fit", "{}", "out"])
     monkeypatch.setattr(run.Distributed, "join", lambda: None)
     monkeypatch.setattr(run.Capture, "load", Mock(side_effect=error))
     assert run.main() == code
-    assert capsys.readouterr().err == f"{told}\n"
+    assert capsys.readouterr().err == f"hnerf: {told}\n"
