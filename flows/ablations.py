@@ -12,7 +12,7 @@ from typing import Any
 
 from prefect import flow
 
-from flows.run_page import publish_markdown
+from flows.run_page import publish_markdown, shown_progress
 from flows.train_subject import prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
@@ -36,6 +36,7 @@ COLUMNS = results.COLUMNS | {"psnr": ("PSNR", "{:.2f}")}
 
 
 @flow(name="ablate", flow_run_name="{capture}-{preset}")
+@shown_progress()
 def ablate(
     capture: Path,
     preset: str = "fast",

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from prefect import flow
 from pydantic import Field
 
-from flows.run_page import publish_markdown
+from flows.run_page import publish_markdown, shown_progress
 from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
@@ -31,6 +31,7 @@ log = logging.getLogger("hnerf.benchmark")
 
 
 @flow(name="benchmark", flow_run_name="{capture}-{study}")
+@shown_progress()
 def benchmark(
     capture: Path,
     study: str = "dynamic",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from prefect import flow
 
-from flows.run_page import publish_markdown
+from flows.run_page import publish_markdown, shown_progress
 from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
@@ -49,6 +49,7 @@ IMAGE_FIGURES = ("psnr", "ssim", "empty_psnr", "posed_psnr", "tracked_psnr")
 
 
 @flow(name="stability", flow_run_name="{capture}")
+@shown_progress()
 def stability(
     capture: Path,
     study: str = "full",

@@ -6,13 +6,17 @@ from unittest.mock import Mock
 
 import pytest
 from PIL import Image
-from prefect import flow, get_client
+from prefect import Flow, flow, get_client
 from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterFlowRunId
 from prefect.context import FlowRunContext
 
 from flows import run_page
+from flows.ablations import ablate
+from flows.benchmark import benchmark
 from flows.run_page import embedded, publish_link, shown_progress, slug
-from hnerf.progress import report
+from flows.stability import stability
+from hnerf.errors import InputError
+from hnerf.progress import Progress, report
 
 
 def test_progress_and_links_are_on_the_page_of_the_run(
@@ -40,6 +44,23 @@ def test_progress_and_links_are_on_the_page_of_the_run(
     assert found.keys() == {"body-fit", "report"}
     assert found["body-fit"].type == "progress" and found["body-fit"].data == 25.0
     assert f"file://{tmp_path}/report.html" in str(found["report"].data)
+
+
+@pytest.mark.parametrize("study", [ablate, benchmark, stability])
+def test_studies_show_how_far_they_have_come(
+    study: Flow[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(*_: Path) -> None:
+        report("ingestion", 1, 2)
+        raise InputError("enough")
+
+    shown = Mock()
+    monkeypatch.setattr(run_page, "FlowRunContext", Mock())
+    monkeypatch.setattr(run_page._ProgressPage, "show", shown)
+    monkeypatch.setattr(f"{study.fn.__module__}.read_capture", read)
+    with pytest.raises(InputError, match="enough"):
+        study.fn(tmp_path, store=tmp_path)
+    shown.assert_called_once_with(Progress("ingestion", 1, 2))
 
 
 def test_a_server_that_is_away_ends_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
