@@ -44,6 +44,11 @@ export class Avatar {
     return this.motion ? this.motion.duration : 0;
   }
 
+  // Whether the motion is the recorded one, which the file has first; others have no frames of the recording.
+  get showsRecording() {
+    return this.motion === this.motions[0];
+  }
+
   // Shows an instant of the motion, with the user's turns of joints and weights of shapes on top of it.
   pose(time) {
     this.restore(); // the mixer writes only what changes, so it must find what it wrote

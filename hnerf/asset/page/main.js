@@ -67,7 +67,7 @@ function connectMotion(viewer) {
   viewer.choose = {};
   viewer.setTime = (time) => {
     avatar.pose(time);
-    viewer.photographs.show(time, avatar.motion === avatar.motions[0]); // the file's first is the recorded one
+    viewer.photographs.show(time, avatar.showsRecording);
     showTime(viewer);
     viewer.changed = true;
   };
@@ -102,8 +102,7 @@ function connectMotion(viewer) {
 }
 
 function showTime({ avatar, recording }) {
-  const recorded = avatar.motion === avatar.motions[0]; // others have no frames of the recording
-  const frame = recorded ? `frame ${recording.first_frame + Math.round(avatar.time * recording.fps)} · ` : "";
+  const frame = avatar.showsRecording ? `frame ${recording.first_frame + Math.round(avatar.time * recording.fps)} · ` : "";
   const text = avatar.duration ? `${frame}${avatar.time.toFixed(2)} s` : "at rest";
   find("time").value = avatar.time;
   find("time").setAttribute("aria-valuetext", text);
