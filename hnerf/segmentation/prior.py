@@ -12,6 +12,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.keypoint_sets import FEET, LIMBS
 from hnerf.capture.people import person_heights_px
 from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.timing import median_step
 from hnerf.config import SegmentationSettings
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
@@ -104,7 +105,7 @@ def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> Iterato
 
 def priors_of(capture: Capture, camera: str, keypoints: np.ndarray, settings: SegmentationSettings) -> Priors:
     """Return the priors of a person's stick figures in one camera, seen as keypoints (frames, 25, 3)."""
-    poses_px = _interpolated(np.where(keypoints[..., 2:] > 0, keypoints[..., :2], np.nan))
+    poses_px = _interpolated(np.where(keypoints[..., 2:] > 0, keypoints[..., :2], np.nan), capture.frames)
     return Priors(partial(_keypoint_prior, capture, camera, poses_px, settings.reach), len(poses_px))
 
 
@@ -194,13 +195,14 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
         own = np.full((*points_m.shape[:-1], 2), np.nan)
         return {name: _in_image(capture.cameras[name], points_m, own) for name in capture.train_cameras}
     found = subject_keypoints(capture)
-    seen = {name: _interpolated(np.where(k[..., 2:] > 0, k[..., :2], np.nan)) for name, k in found.items()}
+    tracks_px = {name: np.where(k[..., 2:] > 0, k[..., :2], np.nan) for name, k in found.items()}
+    seen = {name: _interpolated(tracks, capture.frames) for name, tracks in tracks_px.items()}
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     if len(cameras) == 1:
         return seen
     flat = np.stack([found[camera.name].reshape(-1, 3) for camera in cameras])
     points_m, _, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
-    poses_m = _interpolated(points_m.reshape(-1, 25, 3))
+    poses_m = _interpolated(points_m.reshape(-1, 25, 3), capture.frames)
     return {camera.name: _in_image(camera, poses_m, seen[camera.name]) for camera in cameras}
 
 
@@ -211,18 +213,18 @@ def _in_image(camera: Camera, points_m: np.ndarray, own_px: np.ndarray) -> np.nd
     return np.where(depth_m[..., None] <= 0, np.inf, np.where(np.isfinite(pixels_px), pixels_px, own_px))
 
 
-def _interpolated(tracks: np.ndarray) -> np.ndarray:
-    """Return tracks (frames, 25, D) with NaN gaps filled linearly in time: the mid-hip's absolute position, all others'
-    relative to it."""
-    hip = _filled(tracks[:, 8:9])
+def _interpolated(tracks: np.ndarray, frames: Sequence[int]) -> np.ndarray:
+    """Return tracks (frames, 25, D) with NaN gaps filled linearly in time, by the frames' numbers: the mid-hip's
+    absolute position, all others' relative to it."""
+    at = (np.array(frames) - frames[0]) / median_step(frames)
+    hip = _filled(tracks[:, 8:9], at)
     origin = hip if np.isfinite(hip).all() else np.zeros_like(hip)
-    return origin + _filled(tracks - origin)
+    return origin + _filled(tracks - origin, at)
 
 
-def _filled(tracks: np.ndarray) -> np.ndarray:
-    """Return tracks (frames, ...) with NaN gaps filled linearly in time."""
+def _filled(tracks: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return tracks (frames, ...) with NaN gaps filled linearly between instants `at` (frames,)."""
     filled = tracks.copy()
-    at = np.arange(len(tracks))
     for track in filled.reshape(len(tracks), -1).T:
         known = np.isfinite(track)
         if known.any():

@@ -117,7 +117,14 @@ def test_gaps_move_with_the_mid_hip_by_hand() -> None:
     tracks = np.full((3, 25, 2), np.nan)
     tracks[:, 8] = [[0, 100], [10, 100], [20, 100]]
     tracks[0, 0] = [0, 50]
-    assert _interpolated(tracks)[:, 0].tolist() == [[0, 50], [10, 50], [20, 50]]
-    assert np.isnan(_interpolated(tracks)[:, 5]).all()
+    assert _interpolated(tracks, (3, 4, 5))[:, 0].tolist() == [[0, 50], [10, 50], [20, 50]]
+    assert np.isnan(_interpolated(tracks, (3, 4, 5))[:, 5]).all()
     tracks[:, 8] = np.nan
-    assert _interpolated(tracks)[:, 0].tolist() == [[0, 50]] * 3
+    assert _interpolated(tracks, (3, 4, 5))[:, 0].tolist() == [[0, 50]] * 3
+
+
+def test_gaps_are_filled_in_time_where_frames_are_missing_by_hand() -> None:
+    # The mid-hip walks 10 px a frame, and is not seen in frame 6, after which the next frame is 15.
+    tracks = np.full((4, 25, 2), np.nan)
+    tracks[[0, 1, 3], 8] = [[0, 100], [10, 100], [110, 100]]
+    assert _interpolated(tracks, (4, 5, 6, 15))[2, 8].tolist() == [20, 100]
