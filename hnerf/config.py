@@ -7,18 +7,19 @@ import difflib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
 from hnerf.errors import InputError
-from hnerf.strict_yaml import MAX_DEPTH, parse_yaml, parse_yaml_strings
+from hnerf.strict_yaml import MAX_DEPTH, parse_yaml
 
 S = TypeVar("S", bound=BaseModel)
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 Seed = Annotated[int, Field(ge=0, lt=2**63)]  # of any generator
 MAX_BYTES = 65_536  # of a file of settings
+NULLS = ("", "~", "null", "Null", "NULL")  # as YAML reads nothing
 CLOSE = 0.7  # of difflib: keys that are taken for misspelled ones
 
 
@@ -359,12 +360,13 @@ def overridden(settings: S, overrides: Sequence[str]) -> S:
         key, equals, value = override.partition("=")
         if not equals:
             raise InputError(f"--set {override}: write it as section.name=value")
-        change = parse_yaml(value, f"--set {override}")
         parts = key.split(".")
         if len(parts) > MAX_DEPTH:
             raise InputError(f"--set {key}: no such key; `hnerf settings` lists them")
-        if change is not None and _is_text(settings, parts):
-            change = parse_yaml_strings(value)  # "1.10" is a version, and "03" a camera
+        change: Any = value.strip()
+        literal = change[:1] not in ("'", '"') and change not in NULLS
+        if not (literal and _is_text(settings, parts)):  # in text, "1.10" and "by A: b # 3" are what they are
+            change = parse_yaml(value, f"--set {override}")
         for part in reversed(parts):
             change = {part: change}
         tree = _merged(tree, change)
@@ -373,12 +375,12 @@ def overridden(settings: S, overrides: Sequence[str]) -> S:
 
 
 def _is_text(settings: BaseModel, key: Sequence[str]) -> bool:
-    """Return whether the setting with this key, section by section, takes any text."""
+    """Return whether the setting with this key, section by section, takes any text or path."""
     section: object = settings
     for part in key[:-1]:
         section = dict(section).get(part) if isinstance(section, BaseModel) else None
     field = type(section).model_fields.get(key[-1]) if isinstance(section, BaseModel) else None
-    return field is not None and field.annotation in (str, str | None)
+    return field is not None and not {str, Path}.isdisjoint({field.annotation, *get_args(field.annotation)})
 
 
 def with_changes(settings: Settings, path: Path) -> Settings:

@@ -101,12 +101,23 @@ def test_an_override_that_is_no_yaml_is_one_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [("2", "2"), ("1.10", "1.10"), ("2025-01-02", "2025-01-02"), ("'1'", "1"), ("two b", "two b")]
-)
+    ("value", "text"),
+    [
+        ("2", "2"), ("1.10", "1.10"), ("2025-01-02", "2025-01-02"), ("'1'", "1"), ("two b", "two b"),
+        ("(c) A: all # 3", "(c) A: all # 3"), ("@a [b", "@a [b"), ('"A: b"', "A: b"),
+    ],
+)  # fmt: skip
 def test_text_that_reads_like_a_number_or_a_day_is_text(value: str, text: str) -> None:
     settings = load_settings("fast", [f"asset.version={value}", f"evaluation.holdout={value}"])
     assert (settings.asset.version, settings.evaluation.holdout) == (text, text)
     assert load_settings("fast", ["evaluation.holdout=null"]).evaluation.holdout is None
+
+
+def test_a_path_is_taken_as_it_is() -> None:
+    settings = load_settings("fast", ["segmentation.model=/take #2/1: seg.onnx", "fit.body_model=2024"])
+    assert (settings.segmentation.model, settings.fit.body_model) == (Path("/take #2/1: seg.onnx"), Path("2024"))
+    assert load_settings("fast", ["segmentation.model=null"]).segmentation.model is None
+    assert load_settings("fast", ["fit.body_model=anny"]).fit.body_model == "anny"
 
 
 def test_an_override_of_endless_depth_is_one_line() -> None:
@@ -166,7 +177,7 @@ def test_a_video_in_place_of_a_preset_is_not_read(tmp_path: Path) -> None:
         ("training.field.colour_cells=[8,-3]", "training.field.colour_cells.1: "),
         ("training.field.kind=cube", "training.field: "),
         ("training.field={kind: paper, samples: 4, box_samples: 9}", "training.field: "),
-        ("fit.body_model=3", "fit.body_model: "),
+        ("fit.body_model=null", "fit.body_model: "),
     ],
 )
 def test_errors_in_unions_name_the_key_as_it_is_set(override: str, message: str) -> None:
