@@ -284,8 +284,9 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     render.add_argument("subject", type=Path, help="<store>/subjects/<name> of a finished `hnerf run`")
     _add_out(render, "pictures")
     render.add_argument(
-        "--what", default="colour", metavar="LIST", help=f"one or more of {','.join(PICTURES)} (default: colour)"
-    )
+        "--what", type=_names, default="colour", metavar="LIST",
+        help=f"one or more of {','.join(PICTURES)} (default: colour)",
+    )  # fmt: skip
     view = render.add_mutually_exclusive_group()
     view.add_argument("--camera", help="look through this recorded camera (default: an orbit)")
     view.add_argument("--path", type=Path, help="fly along these cameras: a JSON list, or a folder")

@@ -249,7 +249,7 @@ def render(options: argparse.Namespace) -> None:
         between=options.between and tuple(options.between),
         shape=_shape_changes(options.shape),
         volume=None if options.volume is None else options.volume / 100,
-        what=tuple(dict.fromkeys(options.what.split(","))),
+        what=tuple(dict.fromkeys(options.what)),
         size_px=options.size,
         pictures=options.pictures,
     )

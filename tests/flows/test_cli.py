@@ -15,7 +15,7 @@ from hnerf.calibration.diagnosis import BODY_HEIGHT_M
 from hnerf.capture.formats.export import WRITERS
 from hnerf.config import AssetSettings, SyntheticSettings
 from hnerf.errors import InvalidAsset
-from hnerf.render.subject import MAX_SIZE_PX, MIN_SIZE_PX, OUTPUT_KINDS
+from hnerf.render.subject import MAX_SIZE_PX, MIN_SIZE_PX, OUTPUT_KINDS, RenderOptions
 from hnerf.render.subject import ORBIT_PICTURES as PICTURES_OF_AN_ORBIT
 from tasks.bucket import BucketError
 from tasks.launcher import LostWorkerError, RankFailedError
@@ -266,6 +266,7 @@ def test_output_that_nobody_reads_ends_a_command_quietly() -> None:
         ("calibrate . --ground-frame x", "--ground-frame: give a whole number from 0 to 999999"),
         ("benchmark . --seconds -3", "--seconds: give a number from 0.1 to 1000000"),
         ("benchmark . --methods ,", "--methods: give one name or more"),
+        ("render . --what ,", "--what: give one name or more"),
         ("store gc --keep 0", "--keep: give 1 or more"),
     ],
 )
@@ -289,6 +290,14 @@ def test_choices_and_ranges_are_those_of_the_library() -> None:
     assert (MIN_SIZE_PX, MAX_SIZE_PX) == SIZES_PX
     assert BODY_HEIGHT_M == STATURE_M
     assert PICTURES_OF_AN_ORBIT == ORBIT_PICTURES
+
+
+def test_kinds_of_pictures_are_a_list_with_or_without_spaces(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[RenderOptions] = []
+    monkeypatch.setattr("hnerf.render.subject.render_subject", lambda _, wanted, __: asked.append(wanted) or 1)
+    for given in ([], ["--what", "colour, mask,colour"]):
+        assert main(["render", str(tmp_path), "--out", str(tmp_path / "new"), *given]) == 0
+    assert [wanted.what for wanted in asked] == [("colour",), ("colour", "mask")]
 
 
 @pytest.mark.parametrize(("flags", "allowed"), [([], False), (["--allow-poor"], True)])
