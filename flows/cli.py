@@ -3,6 +3,7 @@
 import argparse
 import errno
 import logging
+import re
 import select
 import sys
 from collections.abc import Callable
@@ -28,6 +29,7 @@ SIZES_PX = (2, 8000)  # of a picture's side, of the same module
 ORBIT_PICTURES = 60  # of the same module
 STATURE_M = (0.5, 2.3)  # of hnerf.calibration.diagnosis, which imports numpy
 MAX_COUNT, MAX_M = 999_999, 1000  # pictures have names of six digits
+ARTIFACT = re.compile("[0-9a-f]{32}")  # a key of tasks.policy
 FOLDERS = {
     "capture": "the capture folder, or one video",
     "folder": "the capture folder",
@@ -119,11 +121,20 @@ def _existing(options: argparse.Namespace) -> list[Path]:
     for motion in motions if isinstance(motions, list) else [motions]:
         if not motion.exists():
             raise InputError(f"{motion}: no such file; give {MOTIONS}")
+    if isinstance(out := getattr(options, "out", None), Path):
+        _require_outside_artifacts(out)
     for option in ("path", "lens"):
         file = getattr(options, option, None)
         if file and not file.exists():
             raise InputError(f"{file}: no such file; give --{option} another")
     return list(folders.values())
+
+
+def _require_outside_artifacts(out: Path) -> None:
+    """Raise InputError where something new would lie in an artifact of a store, among the files of its record."""
+    for folder in out.resolve().parents:
+        if ARTIFACT.fullmatch(folder.name) and folder.with_name(f"{folder.name}.json").is_file():
+            raise InputError(f"{out}: lies in the results of a run, which would count as damaged; give another")
 
 
 def _name(command: Command) -> str:

@@ -20,6 +20,7 @@ from hnerf.render.subject import ORBIT_PICTURES as PICTURES_OF_AN_ORBIT
 from tasks.bucket import BucketError
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError, current_limits
+from tasks.store import Store
 from tests.capture.recordings import write_easymocap
 from tests.shared_data import shared_capture
 
@@ -166,6 +167,19 @@ def test_cameras_are_not_exported_into_the_recording(
     assert "cameras: lies in the recording" in capsys.readouterr().err
     assert sorted(folder.iterdir()) == before
     assert main(["export-cameras", str(folder), "--format", "colmap", "--out", "../ada-cameras"]) == 0
+
+
+@pytest.mark.parametrize("command", ["render ada", "export ada", "store export ada"])
+def test_nothing_new_is_written_into_an_artifact(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`hnerf store verify` would find a fault in it from then on."""
+    monkeypatch.chdir(tmp_path)
+    artifact = Store(tmp_path / "store").get_or_compute("asset", "ab" * 16, lambda _: {})
+    Path("ada").mkdir()
+    Path("ada/asset").symlink_to(artifact.root)
+    assert main([*command.split(), "--out", "ada/asset/new"]) == 2
+    assert "hnerf: ada/asset/new: lies in the results of a run" in capsys.readouterr().err
 
 
 def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
