@@ -313,7 +313,7 @@ class LimitSettings(Section):
 
     stage_s: float = Field(default=1800.0, gt=0)  # a stage may make no progress for this long, plus
     image_s: float = Field(default=5.0, ge=0)  # this for each image: frames times cameras
-    reader_gib: float = Field(default=8.0, gt=0)  # of memory for the process that reads a recording's files
+    reader_gib: float = Field(default=8.0, ge=1)  # of memory for the process that reads a recording's files
 
 
 class Settings(Section):

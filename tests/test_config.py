@@ -45,6 +45,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("training:", "training"),
         ("training: {steps: {a: 1}}", "training.steps"),
         ("asset: {grid_cells: 0}", "asset.grid_cells"),
+        ("limits: {reader_gib: 0.1}", "limits.reader_gib"),
         ("asset: {faces: -1}", "asset.faces"),
         ("asset: {texture_px: -1}", "asset.texture_px"),
         ("asset: {texture_px: 8193}", "asset.texture_px"),
