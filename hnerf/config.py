@@ -340,15 +340,16 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
 
 
 def preset_tree(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return the tree in a preset's file, merged over that of the preset which it names as `based_on`, if any. derived:
-    the presets that are based on this one. Raises InputError where it is among them."""
+    """Return the tree in a preset's file, merged over that of the preset which it names as `based_on`, if any, a path
+    in the same folder or the working directory. derived: the presets that are based on this one. Raises InputError
+    where it is among them."""
     if path.resolve() in derived:
         raise InputError(f"{path}: is based on itself; correct based_on in it")
     tree = read_yaml(path)
     base = tree.pop("based_on", None)
     if base is None:
         return tree
-    below = named_file(str(base), CONFIGS, "preset", "presets")
+    below = named_file(str(base), CONFIGS, "preset", "presets", path.parent)
     return _merged(preset_tree(below, (*derived, path.resolve())), tree)
 
 
@@ -404,11 +405,11 @@ def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def named_file(name: str, folder: Path, one: str, many: str) -> Path:
-    """Return the path of the YAML file of this name in a folder, or else `name` itself as a path. Raises InputError,
-    which lists the files of the folder, where there is neither."""
+def named_file(name: str, folder: Path, one: str, many: str, beside: Path = Path()) -> Path:
+    """Return the path of the YAML file of this name in a folder, or else `name` itself as a path, in the folder
+    `beside` or the working directory. Raises InputError, which lists the files of the folder, where there is none."""
     with suppress(OSError, ValueError):  # of a name that is too long, or holds a NUL
-        for path in (folder / f"{name}.yaml", Path(name)):
+        for path in (folder / f"{name}.yaml", beside / name, Path(name)):
             if path.is_file():
                 return path
     known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
