@@ -73,7 +73,7 @@ def stability(
     """
     whole = load_stability(study)
     plan = whole.restricted_to(only)
-    plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
+    plan = plan.model_copy(update={"methods": tuple(dict.fromkeys(methods))}) if methods else plan
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)

@@ -371,6 +371,12 @@ def test_the_command_prints_the_table(tmp_path: Path, capsys: pytest.CaptureFixt
     assert f"table: {tmp_path / 'store' / 'stability' / 'ada-mine-part.md'}" in shown
 
 
+def test_a_method_that_is_named_twice_is_one(tmp_path: Path) -> None:
+    table = stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", ["fast", "fast"])
+    assert table.name == "ada-mine.md"  # as the study has it
+    assert "| degradation | fast |\n" in table.read_text()
+
+
 def test_unknown_names_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stability", str(tmp_path), "--quick", "--only", "hats"]) == 2
     assert "--only hats: not in this study" in capsys.readouterr().err
