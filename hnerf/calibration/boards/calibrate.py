@@ -75,7 +75,7 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     if footage is None:
         raise InputError(
             f"{folder / 'calibration' / 'extrinsic'}: no board footage, or no charuco.toml and no [board] in "
-            "capture.toml to describe the board; see docs/formats.md"
+            "capture.toml to describe the board; add them, or calibrate with --from person"
         )
     _check_board_found(footage)
     lenses, intrinsics = _intrinsics(folder, footage)
