@@ -115,8 +115,8 @@ def _existing(options: argparse.Namespace) -> list[Path]:
     folders = {what: given for name, what in FOLDERS.items() if isinstance(given := getattr(options, name, None), Path)}
     for what, folder in folders.items():
         if not (folder.is_dir() or (what == FOLDERS["capture"] and folder.is_file())):
-            missing = "folder or video" if what == FOLDERS["capture"] else "folder"
-            raise InputError(f"{folder}: no such {missing}; give {what}")
+            wanted = "folder or video" if what == FOLDERS["capture"] else "folder"
+            raise InputError(f"{folder}: {'is not a' if folder.exists() else 'no such'} {wanted}; give {what}")
     motions = getattr(options, "motion", None) or []
     for motion in motions if isinstance(motions, list) else [motions]:
         if not motion.exists():

@@ -444,6 +444,8 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
                 key.append(str(part))
         key += [str(part) for part in first["loc"][-1:] if first["type"] == "missing"]
         wrong, advice = first["msg"].removeprefix("Value error, "), "correct it"
+        if first["type"] == "missing":
+            wrong, advice = "is missing", "add it"
         if first["type"] == "union_tag_not_found":
             wrong, advice = f"{first['ctx']['discriminator']} is missing", "add it"
         if first["type"] == "extra_forbidden":

@@ -134,6 +134,13 @@ def test_a_field_without_its_kind_is_said(tmp_path: Path) -> None:
         load_settings(str(path))
 
 
+def test_a_key_that_a_file_lacks_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("methods: [fast]\nvariants: {all: {}}")
+    with pytest.raises(InputError, match=rf"^{path}: title: is missing; add it$"):
+        load_study(str(path))
+
+
 def test_a_preset_builds_on_another(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("based_on: nerf\ntraining: {field: {width: 5}}")

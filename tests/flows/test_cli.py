@@ -33,6 +33,7 @@ from tests.shared_data import shared_capture
         (["stability", "absent"], "absent: no such folder"),
         (["render", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
         (["calibrate", "absent"], "absent: no such folder"),
+        (["calibrate", __file__], "test_cli.py: is not a folder; give the capture folder"),
         (["calibrate", ".", "--lens", "absent.yml"], "absent.yml: no such file; give --lens another"),
         (
             ["calibrate", ".", "--height", "1.8"],
