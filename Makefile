@@ -20,11 +20,12 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/hnerf models || echo "warning: no networks; what needs them says so (hnerf models)" >&2
 	touch $@
 
-# Tests start many processes of the same code, which without bytecode would compile it each time.
+# Tests start many processes of the same code, which without bytecode would compile it each time; some wait for them, so
+# that three workers keep two cores busy.
 test: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check --quiet .
-	env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist worksteal
+	env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 3 --dist worksteal
 
 faults: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/faults.py

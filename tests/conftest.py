@@ -28,8 +28,8 @@ os.environ.pop("HNERF_BUCKET", None)  # the user's
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests of a Prefect server: then one of two workers has them all, and starts the only one; and with
-    the types, for which the other would wait at the end."""
+    """Begin with the tests of a Prefect server: then one of the workers has them all, and starts the only one; and
+    with the types, for which the others would wait at the end."""
 
     def order(item: pytest.Item) -> tuple[bool, bool]:
         return "prefect_api" not in getattr(item, "fixturenames", ()), item.name != "test_types_agree"
