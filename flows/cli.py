@@ -3,7 +3,6 @@
 import argparse
 import errno
 import logging
-import re
 import select
 import sys
 from collections.abc import Callable
@@ -16,10 +15,11 @@ from flows.display import display
 from flows.ending import Terminated, drop_what_is_left, open_closed_streams, unwound_by_sigterm
 from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
-from hnerf.errors import DISK_FULL, InputError, InvalidAsset
+from hnerf.errors import DISK_FULL, REASON, InputError, InvalidAsset
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
 from tasks.source import place
+from tasks.store import NAME
 
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143  # the last two as shells have them
 NO_ROOM = (None, *DISK_FULL, errno.EFBIG)  # None: our own, of libraries that do not say why
@@ -29,7 +29,6 @@ SIZES_PX = (2, 8000)  # of a picture's side, of the same module
 ORBIT_PICTURES = 60  # of the same module
 STATURE_M = (0.5, 2.3)  # of hnerf.calibration.diagnosis, which imports numpy
 MAX_COUNT, MAX_M = 999_999, 1000  # pictures have names of six digits
-ARTIFACT = re.compile("[0-9a-f]{32}")  # a key of tasks.policy
 FOLDERS = {
     "capture": "the capture folder, or one video",
     "folder": "the capture folder",
@@ -97,7 +96,7 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
 
 def _fail(why: object, status: int) -> int:
     with suppress(OSError):  # nobody reads it, or there is no room
-        print("hnerf:", " ".join(str(why).splitlines()), file=sys.stderr)
+        print(f"{REASON}{' '.join(str(why).splitlines())}", file=sys.stderr)
     return status
 
 
@@ -133,7 +132,7 @@ def _existing(options: argparse.Namespace) -> list[Path]:
 def _require_outside_artifacts(out: Path) -> None:
     """Raise InputError where something new would lie in an artifact of a store, among the files of its record."""
     for folder in out.resolve().parents:
-        if ARTIFACT.fullmatch(folder.name) and folder.with_name(f"{folder.name}.json").is_file():
+        if NAME.fullmatch(f"{folder.parent.name}/{folder.name}") and folder.with_name(f"{folder.name}.json").is_file():
             raise InputError(f"{out}: lies in the results of a run, which would count as damaged; give another")
 
 

@@ -111,7 +111,8 @@ def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLe
         focal_px = equivalent_mm / DIAGONAL_35MM * np.hypot(width_px, height_px)
         source = f"{equivalent_mm:g} mm, metadata"
     K = np.array([[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]])
-    return KnownLens(Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px), True), source)
+    lens = Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px), estimated=True)
+    return KnownLens(lens, source)
 
 
 def read_lenses(path: Path) -> dict[str, Lens]:
