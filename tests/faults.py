@@ -416,6 +416,7 @@ FAULTS = (
     Fault("cage-outlives", "tasks/cage", "    end_with_parent(signal.SIGKILL, parent)\n", ""),
     # what reading the code line by line found
     Fault("fit-split-runs", "body/observations", "changes != {frame}", "frame not in changes", seen_by="body/fit"),
+    Fault("fit-uneven-frames", "body/pose_prior", "[before * (before", "[after * (before"),
     Fault("clocks-middle", "calibration/clocks/keypoints", "(self.rate - rate) * self.middle_s", "0 * self.middle_s",
           seen_by="calibration/clocks/clocks"),
     Fault("clocks-counted", "capture/clocks", "4), _regular(times_s[name])))", "4),))"),

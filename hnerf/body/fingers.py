@@ -16,6 +16,7 @@ from hnerf.body.pose_prior import add_turn_prior
 from hnerf.body.reprojection import Views, reprojection_term
 from hnerf.body.rig import Rig
 from hnerf.body.robust import geman_mcclure
+from hnerf.capture.timing import median_step
 
 # By segment, from the palm: flexion of a relaxed hand, and standard deviations of flexion, twist and spread, all in
 # degrees and chosen wide; fingers bend between the limits, from straight, and spread up to theirs, to either side, from
@@ -83,10 +84,12 @@ class FingerPrior:
         return add_turn_prior(equations, 0, self.axes, turns, mean, self.std, self.low, self.high)
 
 
-def add_persistence(equations: NormalEquations, turns: Tensor, following: np.ndarray, std: float) -> float:
-    """Add a Gaussian on the change of turns (n, 30, 3) from one frame to the next, and return its cost. following: rows
-    whose next row is the next frame; std: of an angle's change, in radians."""
-    weight = std**-2
+def add_persistence(
+    equations: NormalEquations, turns: Tensor, following: np.ndarray, std: float, steps: np.ndarray
+) -> float:
+    """Add a Gaussian on the change of turns (n, 30, 3) from one frame to the next, and return its cost. following (F,):
+    rows whose next row is the next frame, `steps` (F,) later; std: of an angle's change in one step, in radians."""
+    weight = std**-2 * steps[:, None] ** -2.0
     change = (turns[following + 1] - turns[following]).flatten(1).numpy()
     at = np.arange(change.shape[1])
     for rows, sign in ((following, -1), (following + 1, 1)):
@@ -94,7 +97,7 @@ def add_persistence(equations: NormalEquations, turns: Tensor, following: np.nda
         equations.frame[0][rows[:, None], at, at] += weight
         equations.coupling_diagonal[rows] += weight
     equations.frame[1][following[:, None], at, at] -= weight
-    return 0.5 * weight * float((change**2).sum())
+    return 0.5 * float((weight * change**2).sum())
 
 
 def add_median_prior(equations: NormalEquations, turns: Tensor, shown: Tensor) -> float:
@@ -118,7 +121,7 @@ def add_median_prior(equations: NormalEquations, turns: Tensor, shown: Tensor) -
 def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int, ...]], seconds: float) -> Pose:
     """Return the pose with fingers fitted to hand points (C, n, 42) relative to their palm, everything else held.
 
-    scale_m (C, n): metres a pixel spans; runs: frames that follow each other, `seconds` apart.
+    scale_m (C, n): metres a pixel spans; runs: frames that follow each other; seconds: of their median step.
     """
     rig = pose.rig
     fingers = [rig.joint_names.index(name) for name in finger_joints()]
@@ -131,6 +134,8 @@ def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int,
     points, prior = hand_points(articulation), FingerPrior.of(rig)
     ends = np.cumsum([len(run) for run in runs])
     following = np.setdiff1d(np.arange(ends[-1]), ends - 1)
+    frames = [*itertools.chain(*runs)]
+    steps = np.diff(frames)[following] / median_step(frames)
     theta = pose.theta.clone()
     if not (theta[:, fingers] != 0).any():
         theta[:, fingers] = prior.relaxed()
@@ -142,7 +147,7 @@ def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int,
         equations = NormalEquations(len(theta), len(unknowns), 0)
         equations.add_points(matrix, pull, by_frame[..., unknowns], x.new_zeros(*x.shape, 0))
         prior.add(equations, theta[:, fingers])
-        add_persistence(equations, theta[:, fingers], following, math.radians(RATE_DEG_S) * seconds)
+        add_persistence(equations, theta[:, fingers], following, math.radians(RATE_DEG_S) * seconds, steps)
         if number >= len(STEPS_M) - MEDIAN_STEPS:
             add_median_prior(equations, theta[:, fingers], shown)
         step, _ = equations.step(DAMPING, np.zeros(0), np.zeros(0))

@@ -14,6 +14,8 @@ from hnerf.capture.timing import median_step
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
 
+MAX_GAP = 2  # median steps between neighbours in one run: where frames are unevenly spaced, or one is missing
+
 
 @dataclass(frozen=True)
 class Observations:
@@ -50,14 +52,14 @@ def observe(capture: Capture) -> Observations:
 
 
 def runs(capture: Capture) -> list[tuple[int, ...]]:
-    """Return the frames in runs that follow each other in time: a step in the numbers other than the median one starts
-    a new run. So does a change of split, if it is the only one: all novel poses may be another recording, appended to
-    the first. Splits that alternate divide a single recording."""
-    novel, step = set(capture.novel_pose_frames), median_step(capture.frames)
+    """Return the frames in runs that follow each other in time: a step in the numbers of more than MAX_GAP median
+    ones starts a new run. So does a change of split, if it is the only one: all novel poses may be another recording,
+    appended to the first. Splits that alternate divide a single recording."""
+    novel, farthest = set(capture.novel_pose_frames), MAX_GAP * median_step(capture.frames)
     changes = {b for a, b in pairwise(capture.frames) if (a in novel) != (b in novel)}
     found: list[list[int]] = []
     for frame in capture.frames:
-        if found and frame == found[-1][-1] + step and changes != {frame}:
+        if found and frame <= found[-1][-1] + farthest and changes != {frame}:
             found[-1].append(frame)
         else:
             found.append([frame])

@@ -36,7 +36,6 @@ FLEXION_DEG = {"upperarm01": (-170, 45), "upperleg01": (-130, 40)}  # limits for
 MEAN_FLEXION_DEG = {"upperarm01": -10.0}  # arms are carried in front of the body
 LIMIT_STD_DEG = 2.0  # of a turn beyond its limits
 
-DIFFERENCE = (1.0, -2.0, 1.0)
 OUTLIER_SIGMAS = 3.0  # of an acceleration: a sudden movement or a cut
 
 
@@ -123,16 +122,22 @@ class Smoothness:
     """A prior on the acceleration of keypoints between neighbouring frames (zero velocity would hold back real
     movement).
 
-    Geman-McClure weights let a sudden movement or a cut go. It does not act across gaps in the frames.
+    Geman-McClure weights let a sudden movement or a cut go. It does not act from one run of frames to the next.
     """
 
     def __init__(self, runs: list[tuple[int, ...]], fps: float, sigma_mps2: np.ndarray) -> None:
-        """Prepare the prior. runs: frames that follow each other, one median step apart; fps: of frame numbers;
-        sigma_mps2 (25,): standard deviations."""
+        """Prepare the prior. runs: numbers of frames that follow each other; fps: of these numbers; sigma_mps2 (25,):
+        standard deviations."""
+        frames = [*itertools.chain(*runs)]
         starts = np.cumsum([0] + [len(run) for run in runs])
         triples = [np.arange(a, a + len(run) - 2) for a, run in zip(starts, runs, strict=False)]
         self.first = np.concatenate(triples)  # first row of each three consecutive frames, (T,)
-        self.sigma_m = sigma_mps2 * median_step([*itertools.chain(*runs)]) ** 2 / fps**2
+        step, steps = median_step(frames), np.diff(frames)
+        before, after = steps[self.first], steps[self.first + 1]
+        # (3, T): factors of three positions for their acceleration in median steps: 1, -2, 1 if evenly spaced
+        divisors = np.stack([before * (before + after), -before * after, after * (before + after)])
+        self.difference = 2 * step**2 / divisors
+        self.sigma_m = sigma_mps2 * step**2 / fps**2
 
     def add(self, equations: NormalEquations, keypoints_m: Tensor, jacobian: Tensor) -> float:
         """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), jacobian (n, 25, 3, U).
@@ -143,16 +148,17 @@ class Smoothness:
             return 0.0
         x, j = keypoints_m.numpy(), jacobian.flatten(1, 2).numpy()
         at = [self.first + i for i in range(3)]
-        second = x[at[0]] - 2 * x[at[1]] + x[at[2]]  # (T, 25, 3)
+        by_triple = self.difference[..., None, None]
+        second = by_triple[0] * x[at[0]] + by_triple[1] * x[at[1]] + by_triple[2] * x[at[2]]  # (T, 25, 3)
         squared = (second**2).sum(-1) / self.sigma_m**2
         falloff = 1 + squared / OUTLIER_SIGMAS**2
         weight = np.repeat((self.sigma_m * falloff) ** -2, 3, axis=1)  # (T, 75)
         pull = weight * second.reshape(len(second), -1)
         before = np.einsum("nuu->nu", equations.frame[0]).copy()
-        for i, a in enumerate(DIFFERENCE):
+        for i, a in enumerate(by_triple):
             weighted = a * np.swapaxes(j[at[i]], 1, 2) * weight[:, None]  # (T, U, 75)
-            equations.frame_gradient[at[i]] += a * np.einsum("tku,tk->tu", j[at[i]], pull)
+            equations.frame_gradient[at[i]] += a[..., 0] * np.einsum("tku,tk->tu", j[at[i]], pull)
             for k in range(3 - i):
-                equations.frame[k][at[i]] += DIFFERENCE[i + k] * weighted @ j[at[i + k]]
+                equations.frame[k][at[i]] += by_triple[i + k] * weighted @ j[at[i + k]]
         equations.coupling_diagonal += np.einsum("nuu->nu", equations.frame[0]) - before
         return 0.5 * float((squared / falloff).sum())

@@ -97,8 +97,12 @@ def test_fingers_do_not_spread_beyond_their_limits() -> None:
 def test_a_change_of_one_standard_deviation_costs_a_half() -> None:
     turns = torch.zeros(3, 30, 3, dtype=torch.float64)
     turns[1:, 7, 1] = 0.2
-    assert math.isclose(add_persistence(NormalEquations(3, 90, 0), turns, np.array([0, 1]), 0.2), 0.5)
-    assert add_persistence(NormalEquations(3, 90, 0), turns, np.array([1]), 0.2) == 0  # a gap between the first two
+    both = np.array([0, 1]), 0.2
+    assert math.isclose(add_persistence(NormalEquations(3, 90, 0), turns, *both, np.ones(2)), 0.5)
+    gap = add_persistence(NormalEquations(3, 90, 0), turns, np.array([1]), 0.2, np.ones(1))
+    assert gap == 0  # between the first two
+    twice_as_late = np.array([2.0, 1.0])  # two steps take a change of twice the size
+    assert math.isclose(add_persistence(NormalEquations(3, 90, 0), turns, *both, twice_as_late), 0.125)
 
 
 def test_changes_couple_frames_to_the_next() -> None:
@@ -106,7 +110,7 @@ def test_changes_couple_frames_to_the_next() -> None:
     couple it to the frames before and after. All of the diagonal is coupling."""
     turns = torch.randn(3, 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     equations, x = NormalEquations(3, 6, 0), turns.flatten(1).numpy()
-    cost = add_persistence(equations, turns, np.array([0, 1]), 0.1)
+    cost = add_persistence(equations, turns, np.array([0, 1]), 0.1, np.array([1.0, 1.5]))
     own, coupled = equations.frame[:2]
     by_matrix = np.einsum("tij,tj->ti", own, x)
     by_matrix[:-1] += np.einsum("tij,tj->ti", coupled, x[1:])
@@ -117,14 +121,15 @@ def test_changes_couple_frames_to_the_next() -> None:
 
 
 def test_fingers_persist_within_a_run_at_their_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames 0 and 1, then 5 to 7, a tenth of a second apart: 200 degrees a second are 20 from frame to frame."""
+    """Frames 0 and 1, then 5, 6 and 8, a tenth of a second apart but for the last: 200 degrees a second are 20 from
+    frame to frame, in two steps from 6 to 8."""
     asked = []
     monkeypatch.setattr(fingers, "STEPS_M", (0.2,))
     monkeypatch.setattr(fingers, "add_persistence", lambda _, __, *given: asked.append(given))
     pose = posed(FingerPrior.of(RIG).relaxed(), 5)
-    fit_fingers(pose, views_of(seen_points(pose)), torch.full((2, 5), 0.0045), [(0, 1), (5, 6, 7)], 0.1)
-    ((following, std),) = asked
-    assert following.tolist() == [0, 2, 3] and math.isclose(std, math.radians(20))
+    fit_fingers(pose, views_of(seen_points(pose)), torch.full((2, 5), 0.0045), [(0, 1), (5, 6, 8)], 0.1)
+    ((following, std, steps),) = asked
+    assert following.tolist() == [0, 2, 3] and math.isclose(std, math.radians(20)) and steps.tolist() == [1, 1, 2]
 
 
 def test_fingers_begin_relaxed_unless_they_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,7 +180,7 @@ def test_gradients_are_those_of_the_costs() -> None:
 
     def cost_and_equations(at: torch.Tensor) -> tuple[float, NormalEquations]:
         equations = NormalEquations(3, 90, 0)
-        cost = prior.add(equations, at) + add_persistence(equations, at, np.array([0, 1]), 0.1)
+        cost = prior.add(equations, at) + add_persistence(equations, at, np.array([0, 1]), 0.1, np.ones(2))
         return cost, equations
 
     ends = [cost_and_equations(turns + sign * 1e-6 * direction)[0] for sign in (1, -1)]

@@ -226,6 +226,12 @@ def test_frames_of_a_stride_follow_each_other(tmp_path: Path) -> None:
     assert runs(capture) == [(0, 3, 6), (15, 18)]
 
 
+def test_unevenly_spaced_frames_follow_each_other(tmp_path: Path) -> None:
+    """The median of 2, 4, 2, 2, 5, 1 is 2, of which 4 are two, and 5 more than two."""
+    capture = record(tmp_path, moving_body((0, 2, 6, 8, 10, 15, 16)), RING, ("0",))
+    assert runs(replace(capture, train_frames=capture.frames)) == [(0, 2, 6, 8, 10), (15, 16)]
+
+
 def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> None:
     """The gradient along a random direction through poses, shape and offsets agrees with central differences."""
     capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))

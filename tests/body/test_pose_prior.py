@@ -120,6 +120,27 @@ def test_smoothness_of_a_stride_is_per_second() -> None:
     assert math.isclose(*costs, rel_tol=1e-12)
 
 
+def test_smoothness_of_uneven_frames_is_that_of_their_instants() -> None:
+    """x = t^2 / 2 accelerates by 1 m/s^2, one sigma, whichever its instants: 0, 0.1, 0.3 and 0.4 s."""
+    frames = (0, 1, 3, 4)
+    smoothness = Smoothness([frames], 10.0, np.ones(25))
+    x = torch.zeros(4, 25, 3, dtype=torch.float64)
+    x[:, :, 0] = torch.tensor(frames, dtype=torch.float64)[:, None] / 10
+    equations, jacobian = (
+        NormalEquations(4, 75, 0),
+        torch.eye(75, dtype=torch.float64).view(1, 25, 3, 75).repeat(4, 1, 1, 1),
+    )
+    assert smoothness.add(equations, x, jacobian) < 1e-20
+    x[:, :, 0] = x[:, :, 0] ** 2 / 2
+    assert math.isclose(smoothness.add(equations, x, jacobian), 2 * 25 * 0.5 * 0.9, rel_tol=1e-6)
+    equations = NormalEquations(4, 75, 0)
+    far = Smoothness([frames], 10.0, np.full(25, 1e9))  # quadratic
+    cost = far.add(equations, x, jacobian)
+    assert math.isclose((equations.frame_gradient * x.flatten(1).numpy()).sum(), 2 * cost, rel_tol=1e-9)
+    own = np.einsum("nuu->nu", equations.frame[0])[:, 0] * 1e18 / 1e4  # of (2/3, -1, 1/3) and (1/3, -1, 2/3) by step^2
+    np.testing.assert_allclose(own, [4 / 9, 1 + 1 / 9, 1 / 9 + 1, 4 / 9])
+
+
 def test_smoothness_does_not_reach_across_runs_of_frames() -> None:
     smoothness = Smoothness([(0, 1), (5, 6)], 10.0, np.ones(25))
     x = torch.randn(4, 25, 3, dtype=torch.float64)
