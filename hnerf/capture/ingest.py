@@ -99,7 +99,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     footage = in_step(filmed, clocks, manifest.fps or DEFAULT_FPS)
     if len(filmed) == 1 and not uncalibrated:
         warn_if_uneven(*filmed.values())
-    recorded = _common_frames(footage)
+    recorded, fps = _common_frames(footage), _frame_rate(folder, manifest.fps, filmed, footage)
     _check_subject(folder, manifest, {name: {*recorded, *filmed[name].frames} for name in cameras.train})
     people = _people_in_step(layout, footage)
     seen = [people[name] for name in cameras.train if name in people]
@@ -125,7 +125,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         test_cameras=tuple(cameras.test),
         train_frames=tuple(frames.train),
         novel_pose_frames=tuple(frames.novel_pose),
-        fps=manifest.fps or min((one.fps for one in footage.values() if one.fps), default=DEFAULT_FPS),
+        fps=fps,
         up=manifest.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
@@ -262,6 +262,26 @@ def _common_frames(footage: dict[str, Footage | InStep]) -> tuple[int, ...]:
                 "export all videos at the same rate, or run `hnerf synchronise`"
             )
     return first.frames
+
+
+def _frame_rate(
+    folder: Path, stated: float | None, filmed: dict[str, Footage], footage: dict[str, Footage | InStep]
+) -> float:
+    """Return how many of the common frames a second has.
+
+    A rate stated in `capture.toml` is that of images, and corrects one that all videos have (slow motion). Raises
+    InputError where it is not that of the slowest of several rates, whose frames are counted.
+    """
+    counted = min((one.fps for one in footage.values() if one.fps), default=stated or DEFAULT_FPS)
+    most = (1 + RATE_TOLERANCE) * counted
+    if all((one.fps or stated or DEFAULT_FPS) <= most for one in filmed.values()):
+        return stated or counted
+    if stated and all(one.fps for one in filmed.values()) and abs(stated - counted) > RATE_TOLERANCE * counted:
+        raise InputError(
+            f"{folder / 'capture.toml'}: fps: {stated:g}, but frames are counted by the slowest video, which has "
+            f"{counted:.4g} a second; remove the line"
+        )
+    return counted
 
 
 def _write_cameras(

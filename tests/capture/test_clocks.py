@@ -1,5 +1,6 @@
 """Footage in step: clocks, frame rates, uneven rates, rotation."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from hnerf.capture.uncalibrated import Uncalibrated
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture.mp4 import hold_frames, rotate, write_video
-from tests.capture.recordings import write_easymocap
+from tests.capture.recordings import HEIGHT, WIDTH, write_easymocap
 
 
 def images(name: str, count: int, fps: float) -> ImageFolder:
@@ -137,6 +138,36 @@ def test_the_rate_is_that_of_the_camera_whose_frames_are_counted(tmp_path: Path)
     hold_frames(tmp_path / "film" / "b.mp4", 10, 5)
     assert Video.open(tmp_path / "film" / "b.mp4").fps < 20
     assert ingested(tmp_path / "film", tmp_path / "out").fps == pytest.approx(25)
+
+
+def test_a_stated_rate_contradicts_no_slowest_video(tmp_path: Path) -> None:
+    """a has 25 frames a second, b 50: a's are counted. Only what all videos have in common can be corrected: 25 may be
+    the rate at which both show what they filmed at 100."""
+    folder = tmp_path / "film"
+    write_video(folder / "a.mp4", [10 * k for k in range(10)])
+    write_video(folder / "b.mp4", [5 * k for k in range(20)], fps=50)
+    (folder / "clocks.toml").write_text("[a]\n[b]\n")
+    for stated in ("# none\n", "fps = 25\n", "fps = 25.1\n"):
+        (folder / "capture.toml").write_text(stated)
+        assert ingested(folder, tmp_path / "out").fps == pytest.approx(25)
+    (folder / "capture.toml").write_text("fps = 50\n")
+    with pytest.raises(InputError, match=r"capture.toml: fps: 50, but .* which has 25 a second; remove the line$"):
+        ingested(folder, tmp_path / "out")
+    write_video(folder / "b.mp4", [10 * k for k in range(10)])
+    (folder / "capture.toml").write_text("fps = 100\n")
+    assert ingested(folder, tmp_path / "out").fps == 100
+
+
+def test_a_stated_rate_is_that_of_images_beside_a_slower_video(tmp_path: Path) -> None:
+    """Five images at 50 a second begin and end with three frames of the video, at 25."""
+    folder = write_easymocap(tmp_path / "film")
+    shutil.rmtree(folder / "openpose")
+    shutil.rmtree(folder / "images" / "02")
+    write_video(folder / "videos" / "02.mp4", [100, 110, 120], size_px=(WIDTH, HEIGHT))
+    (folder / "clocks.toml").write_text('["01"]\n["02"]\n')
+    (folder / "capture.toml").write_text("fps = 50\n")
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out")
+    assert (capture.frames, capture.fps) == ((0, 1, 2), 25)
 
 
 def test_a_lone_video_at_an_uneven_rate_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
