@@ -259,6 +259,8 @@ FAULTS = (
     Fault("zjumocap-unit", "capture/formats/zjumocap", "METRES_PER_UNIT = 1e-3", "METRES_PER_UNIT = 1.0"),
     Fault("ingest-stated-rate", "capture/ingest", "        return stated or counted", "        return counted",
           seen_by="capture/clocks"),
+    Fault("segmentation-grey-videos", "segmentation/difference", "MAX_GREY_SPREAD = 6", "MAX_GREY_SPREAD = 0",
+          seen_by="segmentation/segment"),
     Fault("masks-by-file", "capture/ingest", "return _write_masks(normaliser, masks, out, soft=True)", "soft = True"),
     Fault("focal-of-tracks", "capture/video_metadata", "movie + tracks", "movie", "capture/uncalibrated"),
     Fault("estimated-lens", "capture/uncalibrated", " if self.lens_file or not lens.estimated", ""),

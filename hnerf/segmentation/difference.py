@@ -12,6 +12,7 @@ LOG_OFFSET = 6.0  # grey levels added before the logarithm: below them sensors a
 RATIO_NOISE = 0.01  # of log ratios, beyond the pixel's own noise: JPEG, rounding of the plate
 SHADOW_TINT = 0.02  # log chroma per log brightness: gamma and stray light tint deep shadows a little
 SHADOW_SHARE = 0.1  # prior share of the background near a person
+MAX_GREY_SPREAD = 6  # grey levels between the channels of a grey picture: videos round its chroma, by 3 levels
 GREY_SHADOW_SHARE = 0.3  # in grey pictures, where no chroma tells a shadow from the person
 EDGE_OF_SHADOW = 0.1  # log brightness over which the density of shadows darker than the darkest falls off
 PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # std of a person's log ratio to the background
@@ -90,7 +91,7 @@ def difference(
     tint = noise_variance + settings.shadow_chroma**2 + (SHADOW_TINT * np.minimum(brightness, 0)) ** 2
     darkest = float(np.log(settings.darkest_shadow))
     shadow = _log_uniform(brightness, darkest, -darkest if shadowed else 0.0) + _log_gaussian(chroma, tint, 2)
-    grey = (image == image[..., :1]).all()
+    grey = (image.max(-1) - image.min(-1)).max() <= MAX_GREY_SPREAD
     share, tones = (GREY_SHADOW_SHARE, tint) if grey else (SHADOW_SHARE, PERSON_CHROMA**2)
     background = np.logaddexp(np.log(1 - share) + unchanged, np.log(share) + shadow)
     person = _log_gaussian(3 * brightness**2, 3 * PERSON_BRIGHTNESS**2, 1) + _log_gaussian(chroma, tones, 2)

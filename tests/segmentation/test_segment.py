@@ -42,12 +42,14 @@ def test_a_shadow_is_not_the_person_by_hand() -> None:
     assert (found.contrast[:8] == 128).all()
 
 
-def test_in_grey_pictures_a_dark_person_may_be_one_or_a_shadow() -> None:
+@pytest.mark.parametrize("tint", [(0, 0, 0), (-2, 0, -3)], ids=["grey", "grey as a video's decoder has it"])
+def test_in_grey_pictures_a_dark_person_may_be_one_or_a_shadow(tint: tuple[int, ...]) -> None:
     """Left: the plate at 60 % brightness, by which a shadow is e^1 times likelier or less likely than a person; right:
     darker than any shadow."""
     plate = np.full((40, 80, 3), 150, np.uint8)
     image = plate.copy()
     image[10:30, 10:30], image[10:30, 50:70] = 90, 20
+    image, plate = ((pixels + np.array(tint)).astype(np.uint8) for pixels in (image, plate))
     found = difference(image, plate, noise_level(image, plate, np.ones((40, 80), bool)), SETTINGS)
     assert (np.abs(found.log_odds[12:28, 12:28]) < 1).all()
     assert (found.log_odds[12:28, 52:68] > 4).all()
