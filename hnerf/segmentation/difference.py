@@ -115,8 +115,8 @@ def masked_median(images: list[np.ndarray], hidden: list[np.ndarray]) -> tuple[n
     """Return the background of a fixed camera without a clean plate, (H, W, 3) uint8 RGB, and where it is known, (H, W)
     bool.
 
-    It is each pixel's median over the frames in which it is not `hidden` (H, W) bool; where there is no such frame, it
-    is inpainted (Telea 2004).
+    It is each pixel's median over the frames in which it is not `hidden` (H, W) bool, the lighter of two middle values:
+    one in a shadow and one beside it would mix to neither. Where there is no such frame, it is inpainted (Telea 2004).
     """
     behind = np.stack(hidden)
     seen = (~behind).sum(0)
