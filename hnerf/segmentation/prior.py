@@ -97,10 +97,17 @@ class Priors(Sequence[Prior]):
         return self._make(self._numbers[number])
 
 
-def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, Priors]]:
-    """Yield each training camera with the priors of its stick figures."""
-    for name, poses_px in _consistent_keypoints(capture, None).items():
-        yield name, Priors(partial(_keypoint_prior, capture, name, poses_px, settings.reach), len(poses_px))
+def camera_priors(
+    capture: Capture, body: BodyFit | None, settings: SegmentationSettings
+) -> Iterator[tuple[str, Priors]]:
+    """Yield each training camera with the priors of the fitted body, else of what a network took for a person, either
+    together with the stick figure, which it may miss; else of the stick figure alone."""
+    prior: Callable[..., Prior] = _network_prior if capture.has_person_masks else _keypoint_prior
+    if body is not None:
+        vertices_m = body.vertices_m().numpy()[[body.index(f) for f in capture.frames]]
+        prior = partial(_body_prior, vertices_m=vertices_m, faces=body.rig.faces.numpy())
+    for name, poses_px in _consistent_keypoints(capture, body).items():
+        yield name, Priors(partial(prior, capture, name, poses_px, settings.reach), len(poses_px))
 
 
 def priors_of(capture: Capture, camera: str, keypoints: np.ndarray, settings: SegmentationSettings) -> Priors:
@@ -115,18 +122,9 @@ def _keypoint_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: 
     return Prior.around(stick.core, stick.body, stick.completed, stick.height_px, reach, upright, stick.behind)
 
 
-def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> Iterator[tuple[str, Priors]]:
-    """Yield each training camera with the priors of the fitted body together with the stick figure, which a poor fit
-    may miss."""
-    vertices_m, faces = body.vertices_m().numpy()[[body.index(f) for f in capture.frames]], body.rig.faces.numpy()
-    for name, poses_px in _consistent_keypoints(capture, body).items():
-        make = partial(_body_prior, capture, name, poses_px, vertices_m, faces, settings.reach)
-        yield name, Priors(make, len(poses_px))
-
-
 def _body_prior(
-    capture: Capture, camera: str, poses_px: np.ndarray, vertices_m: np.ndarray, faces: np.ndarray, reach: float,
-    number: int,
+    capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int, vertices_m: np.ndarray,
+    faces: np.ndarray,
 ) -> Prior:  # fmt: skip
     stick = _stick_figure(capture.cameras[camera], poses_px[number])
     covered = silhouette(capture.cameras[camera], vertices_m[number], faces)
@@ -136,14 +134,8 @@ def _body_prior(
     return Prior.around(core, covered, covered, stick.height_px, reach / 2, upright, stick.behind)
 
 
-def network_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, Priors]]:
-    """Yield each training camera with the priors of what a network took for a person, as far as it is the subject,
-    together with the stick figure."""
-    for name, poses_px in _consistent_keypoints(capture, None).items():
-        yield name, Priors(partial(_network_prior, capture, name, poses_px, settings.reach), len(poses_px))
-
-
 def _network_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:
+    """Return the prior of what a network took for a person, as far as it is the subject."""
     likely = capture.person_probability(camera, capture.frames[number])
     assert likely is not None  # a network looks at every image of a training camera
     figure = _keypoint_prior(capture, camera, poses_px, reach, number)

@@ -15,7 +15,7 @@ from hnerf.errors import InputError
 from hnerf.progress import tracked
 from hnerf.segmentation.backends import Backend, choose_backend
 from hnerf.segmentation.learned import Network
-from hnerf.segmentation.prior import Priors, body_priors, keypoint_priors, network_priors
+from hnerf.segmentation.prior import Priors, camera_priors
 from hnerf.segmentation.verdicts import MaskVerdict, area_jumps, judge_mask
 from hnerf.side_by_side import side_by_side
 
@@ -30,10 +30,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     kept where there are several people. A mask that cannot be right is dropped and named in the report. Raises
     InputError if no mask of a camera is left.
     """
-    if body is not None:
-        priors = body_priors(capture, body, settings)
-    else:
-        priors = (network_priors if capture.has_person_masks else keypoint_priors)(capture, settings)
+    priors = camera_priors(capture, body, settings)
     network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}

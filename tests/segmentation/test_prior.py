@@ -11,8 +11,7 @@ from hnerf.segmentation.prior import (
     _consistent_keypoints,
     _interpolated,
     _stick_figure,
-    keypoint_priors,
-    network_priors,
+    camera_priors,
 )
 from tests.calibration.synthetic import SIZE_PX, detections, ring, turned, write_capture
 from tests.segmentation.scene import write_likely, write_scene
@@ -34,7 +33,7 @@ def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, un
     if unseen == FEET:
         found["c1"][:, :, unseen] = 0
     np.savez(tmp_path / "keypoints.npz", **found)
-    priors = dict(keypoint_priors(capture, SegmentationSettings()))
+    priors = dict(camera_priors(capture, None, SegmentationSettings()))
     for (camera, frame), person in truth.items():
         assert priors[camera][frame].reach[person].all()
 
@@ -43,9 +42,9 @@ def test_a_networks_mask_says_where_the_subject_is(tmp_path: Path) -> None:
     """Its body is what is likelier than not of him, not of the poster; its core is surely his; where the network missed
     him the stick figure speaks."""
     capture, truth = write_scene(tmp_path, 2)
+    sticks = dict(camera_priors(capture, None, SegmentationSettings()))
     write_likely(capture, truth | {("c0", 3): np.zeros_like(truth["c0", 3])})
-    found = dict(network_priors(capture, SegmentationSettings()))
-    sticks = dict(keypoint_priors(capture, SegmentationSettings()))
+    found = dict(camera_priors(capture, None, SegmentationSettings()))
     for (camera, frame), person in truth.items():
         prior = found[camera][frame]
         if (camera, frame) == ("c0", 3):
@@ -63,7 +62,7 @@ def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_pat
         found = {name: stored[name] for name in stored.files}
     found["c0"][0, 0, 4, :2] = 1e7, -1e9
     np.savez(tmp_path / "keypoints.npz", **found)
-    prior = dict(keypoint_priors(capture, SegmentationSettings()))["c0"][0]
+    prior = dict(camera_priors(capture, None, SegmentationSettings()))["c0"][0]
     assert 5 * 400 < prior.height_px < 6 * 400  # from 5 heights above the image to the feet in it
     assert prior.reach[truth["c0", 0]].all()
 
@@ -83,7 +82,7 @@ def test_nobody_is_where_a_camera_looks_away(tmp_path: Path) -> None:
     stranger = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     stranger[300:900, 400:600] = 255
     write_image(tmp_path / "masks" / "c2" / "000000.png", stranger)
-    prior = dict(keypoint_priors(capture, SegmentationSettings()))["c2"][0]
+    prior = dict(camera_priors(capture, None, SegmentationSettings()))["c2"][0]
     assert prior.elsewhere and not Given(capture, "c2").mask(0, prior).any()
 
 
