@@ -20,7 +20,7 @@ from provenance import SHARED, arguments, log_progress, provenance, provenance_l
 
 from hnerf.capture.capture import PERSON, Capture, read_rgb
 from hnerf.capture.ingest import ingest
-from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.subject import ranked_people
 from hnerf.capture.subset import subset
 from hnerf.config import CaptureSettings, DetectionSettings
 from hnerf.detection.detect import detect, find_in_camera
@@ -91,7 +91,7 @@ def cost_of_a_frame(capture: Capture, size: str, out: Path) -> dict[str, float]:
 
 def limb_keypoints(capture: Capture) -> np.ndarray:
     """Return the limb keypoints of the subject, (C, frames, 12, 3)."""
-    return np.stack(list(subject_keypoints(capture).values()))[:, :, LIMBS]
+    return ranked_people(capture)[0].keypoints[:, :, LIMBS]
 
 
 def score_residuals(folder: Path, capture: Capture) -> dict[str, Any]:

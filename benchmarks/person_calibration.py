@@ -28,7 +28,7 @@ from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from
 from hnerf.calibration.refine import Refinement, refine
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
-from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.subject import ranked_people
 from hnerf.capture.uncalibrated import USUAL_FOCAL
 from hnerf.config import CalibrationSettings, CaptureSettings, DetectionSettings, SyntheticSettings
 from hnerf.detection.detect import detect
@@ -82,7 +82,7 @@ def measure_capture(folder: Path, scratch: Path) -> dict[str, Any]:
 def _reference(capture: Capture) -> list[Camera]:
     """Return the cameras to compare with: as refined, by keypoints and image matches, where held-out frames ask for
     it."""
-    keypoints = np.stack(list(subject_keypoints(capture).values()))
+    keypoints = ranked_people(capture)[0].keypoints
     given = [capture.cameras[name] for name in capture.train_cameras]
     if capture.name != REAL:
         return given
@@ -99,7 +99,7 @@ def _guessed(camera: Camera) -> Camera:
 
 def _score(capture: Capture, reference: list[Camera], known: bool) -> dict[str, Any]:
     """Calibrate, and return the worst camera's errors and the seconds of one thread."""
-    keypoints = np.stack(list(subject_keypoints(capture).values()))
+    keypoints = ranked_people(capture)[0].keypoints
     of_reference = measure(reference, keypoints)
     lost = {c.name: Camera(c.name, c.K, np.eye(3), np.zeros(3), *c.size_px) for c in reference}
     if not known:

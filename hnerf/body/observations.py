@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hnerf.body.reprojection import Views
 from hnerf.capture.capture import Capture
-from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.subject import ranked_people
 from hnerf.capture.timing import median_step
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
@@ -39,9 +39,8 @@ class Observations:
 
 def observe(capture: Capture) -> Observations:
     """Return the keypoints of every frame, from training cameras only. Raises InputError where the capture has none."""
-    people = subject_keypoints(capture)
+    keypoints = ranked_people(capture)[0].keypoints
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
-    keypoints = np.stack([people[camera.name] for camera in cameras])
     count, frames = keypoints.shape[:2]
     space_m = np.full((frames, 25, 3), np.nan)
     if count > 1:

@@ -28,7 +28,7 @@ from hnerf.calibration.report import CalibrationReport, CameraVerdict
 from hnerf.calibration.sizes import size_reasons
 from hnerf.calibration.synchronise import Timing, measure_timing, synchronise_capture
 from hnerf.capture.capture import Capture
-from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.subject import ranked_people
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -47,7 +47,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     """
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
-    keypoints = _keypoints(capture)
+    keypoints = ranked_people(capture)[0].keypoints
     empty = [name for name, seen in zip(capture.train_cameras, keypoints, strict=True) if not seen[..., 2].any()]
     if empty:
         return _without(empty, capture, settings)
@@ -62,7 +62,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     cameras, mistakes = undo_mistake(given, keypoints)
     _check_height(capture, measure(cameras, keypoints) if mistakes else before)
     synchronised, held_out_px, notes = synchronise_capture(capture, cameras, keypoints, settings)
-    keypoints = keypoints if synchronised is capture else _keypoints(synchronised)
+    keypoints = keypoints if synchronised is capture else ranked_people(synchronised)[0].keypoints
     evidence = Evidence.of(synchronised, keypoints)
     refinement = refine(synchronised, cameras, keypoints, evidence.outlines, evidence.matches, settings)
     used = [new if new is old else _rounded(new) for old, new in zip(cameras, refinement.cameras, strict=True)]
@@ -103,11 +103,6 @@ def _rounded(camera: Camera) -> Camera:
     thousandth of a millimetre."""
     turn = np.round(cv2.Rodrigues(camera.R)[0], 7)
     return dataclasses.replace(camera, K=np.round(camera.K, 4), R=cv2.Rodrigues(turn)[0], t_m=np.round(camera.t_m, 6))
-
-
-def _keypoints(capture: Capture) -> np.ndarray:
-    """Return the subject's keypoints in the training cameras, (C, frames, 25, 3)."""
-    return np.stack(list(subject_keypoints(capture).values()))
 
 
 def _without(empty: list[str], capture: Capture, settings: CalibrationSettings) -> CalibrationReport:

@@ -21,7 +21,7 @@ from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_calibration
 from hnerf.capture.lens import Lens
-from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.subject import ranked_people, subject_keypoints
 from hnerf.capture.timing import median_step
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
@@ -116,8 +116,7 @@ def calibrate_from_person(
         keypoints = _each_alone(capture)
         start = [capture.cameras[name] for name in capture.train_cameras]
         rig = first_poses(start, keypoints)
-        agreed = subject_keypoints(capture.with_cameras(capture.cameras | {c.name: c for c in rig}))
-        keypoints = np.stack([agreed[name] for name in capture.train_cameras])
+        keypoints = ranked_people(capture.with_cameras(capture.cameras | {c.name: c for c in rig}))[0].keypoints
         fit, held_out_px = fit_lenses(rig, keypoints, unknown_focal, min_improvement)
         straight = undistort(keypoints, fit.cameras, unknown_focal, fit.k1)
         found = measure(fit.cameras, straight)
