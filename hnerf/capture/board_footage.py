@@ -9,7 +9,6 @@ import dataclasses
 import logging
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -308,22 +307,18 @@ def _frame_numbers(root: Path, footage: dict[str, Footage], synchronised: bool) 
 
 def _sync_indices(path: Path) -> dict[str, tuple[int, ...]]:
     """Read Caliscope's table: a row for every frame of every camera, with a `sync_index` that simultaneous frames
-    share."""
+    share. Raises InputError if it is no such table."""
     found: dict[str, list[int]] = {}
-    for row in _csv_rows(path):
+    try:
+        rows = list(csv.DictReader(safe_io.read_text(path, MAX_TABLE_BYTES).splitlines()))
+    except csv.Error as error:  # such as a field longer than 128 KiB
+        raise InputError(f"{path}: not a table ({error}); export it again or remove it") from None
+    for row in rows:
         index, camera = row.get("sync_index") or "", row.get("cam_id") or row.get("port") or ""
         if not (re.fullmatch(r"[0-9]{1,9}", index) and re.fullmatch(r"[0-9]{1,4}", camera)):
             raise InputError(f"{path}: a row lacks a whole-numbered sync_index or cam_id; export it again or remove it")
         found.setdefault(f"cam_{camera}", []).append(int(index))
     return {name: tuple(sorted(indices)) for name, indices in found.items()}
-
-
-def _csv_rows(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table. Raises InputError if it is none."""
-    try:
-        yield from csv.DictReader(safe_io.read_text(path, MAX_TABLE_BYTES).splitlines())
-    except csv.Error as error:  # such as a field longer than 128 KiB
-        raise InputError(f"{path}: not a table ({error}); export it again or remove it") from None
 
 
 def _brightness(grey: np.ndarray, square_px: np.ndarray) -> float:
