@@ -1,10 +1,13 @@
 import dataclasses
 import math
+from collections.abc import Callable
 
+import numpy as np
 import torch
 
 from hnerf.body.anny import ADULT, anny_rig
 from hnerf.body.articulation import Articulation, Pose, left_jacobian, with_offsets
+from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
 from tests.body.two_bone import two_bone_rig
 
@@ -17,6 +20,19 @@ def random_pose(rig: Rig, frames: int) -> Pose:
     root[:, :3, :3] = rotation_from_axis_angle(torch.randn(frames, 3, generator=generator, dtype=torch.float64))
     root[:, :3, 3] = torch.randn(frames, 3, generator=generator, dtype=torch.float64)
     return Pose(rig, theta, root, 0.01 * torch.randn(25, 3, generator=generator, dtype=torch.float64))
+
+
+def check_gradient(
+    pose: Pose, cost_and_equations: Callable[[Pose], tuple[float, NormalEquations]], rtol: float, least: float
+) -> None:
+    """Require that the slope along a random direction, which is not smaller than `least`, is that of the cost."""
+    shape, generator = (len(pose.theta), Articulation(pose.rig).unknowns), torch.Generator().manual_seed(0)
+    direction = torch.randn(*shape, generator=generator, dtype=torch.float64)
+    moved = (Articulation(pose.rig).apply_step(pose, sign * 1e-6 * direction) for sign in (1, -1))
+    above, below = (cost_and_equations(end)[0] for end in moved)
+    slope = (cost_and_equations(pose)[1].frame_gradient * direction.numpy()).sum()
+    assert abs(slope) > least
+    np.testing.assert_allclose(slope, (above - below) / 2e-6, rtol=rtol)
 
 
 def numeric_jacobian(pose: Pose, points: torch.Tensor) -> torch.Tensor:

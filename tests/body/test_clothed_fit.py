@@ -20,10 +20,8 @@ from hnerf.body.rig import joint_transforms
 from hnerf.config import FitSettings
 from hnerf.geometry.silhouette import silhouette
 from tests.body.recorded_body import moving_body, record, ring_camera
-from tests.body.test_contour_fit import ball, disc
+from tests.body.test_contour_fit import SCALE_M, SEEN_PX, ball, disc
 
-SCALE_M = 3 / 281.6
-SEEN_PX = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)
 RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
 
 
@@ -62,33 +60,32 @@ def test_what_is_seen_often_is_worn_as_seen() -> None:
         np.testing.assert_allclose(found, worn_m, rtol=1e-4)
 
 
+def matched(edge: Outline) -> tuple[ContourResiduals, np.ndarray]:
+    """Return how a ball of 0.2 m before a camera matches an outline, and the outward directions of matched vertices."""
+    vertices, faces = ball(0.2, 1.0)
+    rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
+    return rows, (vertices[rows.vertices] - (0, 0, 1)) / 0.2
+
+
 @pytest.mark.parametrize("grow_px", [2, -2])
 def test_outlines_pull_both_ways_alike(grow_px: int) -> None:
     """A ball 2 px too small or too large has residuals of 2 px, with a weight of 1 / (1 + (off / 2 cm)^2)^2."""
-    vertices, faces = ball(0.2, 1.0)
     edge = outline(disc(SEEN_PX + grow_px), 1.0)
-    rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
+    rows, outwards = matched(edge)
     assert len(rows.vertices) > 0.9 * len(edge.points_px)
     assert np.median(rows.residual_m) == pytest.approx(-grow_px * SCALE_M, abs=SCALE_M)
     np.testing.assert_allclose(rows.weight, (1 + (rows.residual_m / 0.02) ** 2) ** -2)
-    outwards = (vertices[rows.vertices] - (0, 0, 1)) / 0.2
     assert ((rows.gradient * outwards).sum(1) > 0.9).all()
 
 
 def test_what_is_too_far_off_matches_nothing() -> None:
     """5 px of 1.07 cm each are more than 4 cm."""
-    vertices, faces = ball(0.2, 1.0)
-    edge = outline(disc(SEEN_PX + 5), 1.0)
-    rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
-    assert len(rows.vertices) == 0
+    assert len(matched(outline(disc(SEEN_PX + 5), 1.0))[0].vertices) == 0
 
 
 def test_outlines_that_face_the_other_way_match_nothing() -> None:
-    vertices, faces = ball(0.2, 1.0)
     edge = outline(disc(SEEN_PX), 1.0)
-    edge = replace(edge, normals=-edge.normals)
-    rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
-    assert len(rows.vertices) == 0
+    assert len(matched(replace(edge, normals=-edge.normals))[0].vertices) == 0
 
 
 def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pose, list[list[Outline | None]]]:

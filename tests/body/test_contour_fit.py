@@ -24,6 +24,8 @@ from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
 SETTINGS = FitSettings(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
+SCALE_M = 3 / 281.6  # of a pixel, at the focal length of `ring_camera` from 3 m away
+SEEN_PX = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)  # radius at which a ball of 0.2 m looks
 
 
 def ball(radius_m: float, height_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -42,6 +44,14 @@ def ball(radius_m: float, height_m: float) -> tuple[np.ndarray, np.ndarray]:
 def disc(radius_px: float, size_px: int = 256) -> np.ndarray:
     y, x = np.mgrid[:size_px, :size_px]
     return (x - size_px / 2) ** 2 + (y - size_px / 2) ** 2 < radius_px**2
+
+
+def matched(mask: np.ndarray) -> tuple[ContourResiduals, np.ndarray]:
+    """Return how a ball of 0.2 m before a camera matches a mask, and the outward directions of the matched vertices."""
+    vertices, faces = ball(0.2, 1.0)
+    normals, camera = normals_of(vertices, faces), ring_camera("a", 0.3)
+    rows = match(camera, outline(mask, 1.0), SCALE_M, vertices, normals, faces, SETTINGS)
+    return rows, (vertices[rows.vertices] - (0, 0, 1)) / 0.2
 
 
 def test_an_outline_runs_between_the_pixels_and_points_outwards() -> None:
@@ -78,40 +88,27 @@ def test_normals_point_out_of_a_ball() -> None:
 
 def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() -> None:
     """A ball of 0.2 m at 3 m, 281.6 px focal length, looks 18.8 px large; the masks are 5 px larger and smaller."""
-    camera = ring_camera("a", 0.3)
-    vertices, faces = ball(0.2, 1.0)
-    normals = normals_of(vertices, faces)
-    scale_m = 3 / 281.6
-    seen_px = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)
     for grow_px, sigma_m in ((5, 0.02), (-5, 0.01)):
-        edge = outline(disc(seen_px + grow_px), 1.0)
-        rows = match(camera, edge, scale_m, vertices, normals, faces, SETTINGS)
+        rows, outwards = matched(disc(SEEN_PX + grow_px))
         assert len(rows.vertices) > 20
-        np.testing.assert_allclose(np.abs(rows.residual_m).max(), 5 * scale_m, atol=0.6 * scale_m)
-        assert (-np.sign(grow_px) * rows.residual_m > 2 * scale_m).all()  # rim vertices lie up to 2.5 px deep
+        np.testing.assert_allclose(np.abs(rows.residual_m).max(), 5 * SCALE_M, atol=0.6 * SCALE_M)
+        assert (-np.sign(grow_px) * rows.residual_m > 2 * SCALE_M).all()  # rim vertices lie up to 2.5 px deep
         fades, holds = 1 / (1 + (rows.residual_m / 0.1) ** 2) ** 2, 0.01345 / np.abs(rows.residual_m)
         robust = fades if grow_px > 0 else np.minimum(1, holds)
         np.testing.assert_allclose(rows.weight, robust / sigma_m**2)
-        outwards = (vertices[rows.vertices] - (0, 0, 1)) / 0.2
         assert ((rows.gradient * outwards).sum(1) > 0.9).all()  # moving out raises the residual, metre for metre
 
 
 def test_a_body_that_fills_its_mask_is_left_alone() -> None:
-    camera = ring_camera("a", 0.3)
-    vertices, faces = ball(0.2, 1.0)
-    edge = outline(disc(281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)), 1.0)
-    rows = match(camera, edge, 3 / 281.6, vertices, normals_of(vertices, faces), faces, SETTINGS)
-    assert np.abs(rows.residual_m).max() < 1.0 * 3 / 281.6
+    assert np.abs(matched(disc(SEEN_PX))[0].residual_m).max() < SCALE_M
 
 
 def test_a_part_that_a_mask_lacks_pushes_no_harder_than_one_that_sticks_out_a_little() -> None:
     """Half of the mask is missing. Beyond 1.345 standard deviations of 0.01 m every vertex outside pushes with 1.345 /
     0.01 m."""
-    camera = ring_camera("a", 0.3)
-    vertices, faces = ball(0.2, 1.0)
-    seen = disc(281.6 * 0.2 / np.sqrt(3**2 - 0.2**2))
+    seen = disc(SEEN_PX)
     seen[:, 128:] = False
-    rows = match(camera, outline(seen, 1.0), 3 / 281.6, vertices, normals_of(vertices, faces), faces, SETTINGS)
+    rows, _ = matched(seen)
     out = rows.residual_m > 0.01345
     assert rows.residual_m[out].min() < 0.04 and rows.residual_m[out].max() > 0.18
     np.testing.assert_allclose((rows.weight * rows.residual_m)[out], 134.5)
