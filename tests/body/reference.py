@@ -22,6 +22,11 @@ def closest_points_reference(points_m: Tensor, vertices_m: Tensor, faces: Tensor
     return ClosestPoints(within, barycentric.to(points_m), torch.where(found, sign, 1.0))
 
 
+def on_surface(vertices_m: Tensor, faces: Tensor, found: ClosestPoints) -> Tensor:
+    """Return where closest points are, (N, 3)."""
+    return (vertices_m[faces[found.face]] * found.barycentric[..., None]).sum(1)
+
+
 def solid_angle(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """Return the signed solid angle of triangles (..., 3) seen from x (..., 3): 4 pi in total inside a closed surface
     with outward faces."""

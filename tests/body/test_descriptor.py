@@ -12,17 +12,22 @@ from hnerf.body.canonical import PosedBodies, axis_angle_from_rotation, distinct
 from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
 from tests.body.boxes import box_faces, box_rig, box_vertices
-from tests.body.reference import closest_points_reference, solid_angle
+from tests.body.reference import closest_points_reference, on_surface, solid_angle
 
 
-def test_box_by_hand():
-    """From (2, 0.5, 0.5) the unit box is 1 m away, nearest at (1, 0.5, 0.5); its centre lies 0.5 m inside."""
-    vertices, faces = box_vertices(), box_faces()
-    points = torch.tensor([[2.0, 0.5, 0.5], [0.5, 0.5, 0.4]])
-    found = BodyMeshes(vertices[None], faces).closest_points(points, torch.zeros(2, dtype=torch.int32), 5.0)
-    closest = (vertices[faces[found.face]] * found.barycentric[..., None]).sum(1)
-    torch.testing.assert_close(closest[0], torch.tensor([1.0, 0.5, 0.5]))
-    torch.testing.assert_close(closest[1], torch.tensor([0.5, 0.5, 0.0]))
+@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("moved_m", [0.0, 1.0])
+def test_box_by_hand(exact: bool, moved_m: float):
+    """From (2, 0.5, 0.5) the unit box is 1 m away, nearest at (1, 0.5, 0.5); its centre lies 0.5 m inside. If the box
+    and the points move along x, so does what is found."""
+    away = torch.tensor([moved_m, 0.0, 0.0])
+    vertices, faces, points = box_vertices(), box_faces(), torch.tensor([[2.0, 0.5, 0.5], [0.5, 0.5, 0.4]])
+    meshes = BodyMeshes(vertices[None], faces)
+    if moved_m:
+        meshes.refit((vertices + away)[None])
+    found = meshes.closest_points(points + away, torch.zeros(2, dtype=torch.int32), 5.0, exact)
+    closest = on_surface(vertices + away, faces, found)
+    torch.testing.assert_close(closest, torch.tensor([[1.0, 0.5, 0.5], [0.5, 0.5, 0.0]]) + away)
     assert found.sign.tolist() == [1.0, -1.0]
 
 
@@ -57,24 +62,9 @@ def test_fast_form_agrees_with_the_reference(exact: bool):
     fast = BodyMeshes(vertices[None], rig.faces).closest_points(points, torch.zeros(800, dtype=torch.int32), 9.0, exact)
     slow = closest_points_reference(points, vertices, rig.faces, 9.0)
 
-    def distance(found):
-        return ((vertices[rig.faces[found.face]] * found.barycentric[..., None]).sum(1) - points).norm(dim=1)
-
-    torch.testing.assert_close(distance(fast), distance(slow), atol=1e-6, rtol=0)
+    distances = [(on_surface(vertices, rig.faces, found) - points).norm(dim=1) for found in (fast, slow)]
+    torch.testing.assert_close(*distances, atol=1e-6, rtol=0)
     assert torch.equal(fast.sign, slow.sign)
-
-
-@pytest.mark.parametrize("exact", [False, True])
-def test_moved_bodies_are_found_where_they_are(exact: bool):
-    """The unit box, moved to [1, 2] along x, gives the same for the points of `test_box_by_hand`, moved along."""
-    vertices, away = box_vertices(), torch.tensor([1.0, 0.0, 0.0])
-    points = away + torch.tensor([[2.0, 0.5, 0.5], [0.5, 0.5, 0.4]])
-    meshes = BodyMeshes(vertices[None], box_faces())
-    meshes.refit((vertices + away)[None])
-    found = meshes.closest_points(points, torch.zeros(2, dtype=torch.int32), 5.0, exact)
-    closest = ((vertices + away)[box_faces()[found.face]] * found.barycentric[..., None]).sum(1)
-    torch.testing.assert_close(closest, torch.tensor([[2.0, 0.5, 0.5], [1.5, 0.5, 0.0]]))
-    assert found.sign.tolist() == [1.0, -1.0]
 
 
 def test_exact_sign_inside_a_body_that_intersects_itself():
@@ -168,8 +158,7 @@ def reference_distance(points: Tensor, turn: Tensor, move: Tensor, beta: Tensor)
     root[0, :3, 3] = move
     vertices = pose_vertices(rig, theta, root)[0]
     found = closest_points_reference(points, vertices, rig.faces, 5.0)
-    closest = (vertices[rig.faces[found.face]] * found.barycentric[..., None]).sum(1)
-    return found.sign * (points - closest).norm(dim=-1)
+    return found.sign * (points - on_surface(vertices, rig.faces, found)).norm(dim=-1)
 
 
 BENT = torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64)

@@ -9,7 +9,7 @@ from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.body.limbs import CLOSE_M
 from hnerf.body.rig import Rig
 from tests.body.boxes import box_faces, box_rig, box_vertices, hinged
-from tests.body.reference import closest_points_reference
+from tests.body.reference import closest_points_reference, on_surface
 
 LEVELS = 40
 SHOULDER_M = (1.2, 0.05, 1.0)
@@ -101,22 +101,13 @@ def test_other_limbs_are_closest_as_when_every_triangle_is_tried() -> None:
     points_m += torch.tensor([0.8, -0.1, -0.1])
     found, other = by_other_limbs(bodies, points_m)
     arms = rig.faces.amin(1) >= 4 * (LEVELS + 1)
-    expected = torch.stack(
-        [
-            closest_points_reference(points_m, vertices_m, rig.faces[of_limb], REACH_M).sign
-            * closest_distance(points_m, vertices_m, rig.faces[of_limb])
-            for of_limb in (~arms, arms)
-        ],
-        1,
-    )
+    expected = []
+    for faces in (rig.faces[~arms], rig.faces[arms]):
+        of_limb = closest_points_reference(points_m, vertices_m, faces, 9.0)
+        expected.append(of_limb.sign * (on_surface(vertices_m, faces, of_limb) - points_m).norm(dim=1))
     of_arm = (other.vertex >= 4 * (LEVELS + 1)).long()
     assert len(found) > 75 and 0 < of_arm.sum() < len(found)
-    torch.testing.assert_close(other.d, expected[found, of_arm], atol=1e-5, rtol=0)
-
-
-def closest_distance(points_m: Tensor, vertices_m: Tensor, faces: Tensor) -> Tensor:
-    found = closest_points_reference(points_m, vertices_m, faces, 9.0)
-    return ((vertices_m[faces[found.face]] * found.barycentric[..., None]).sum(1) - points_m).norm(dim=1)
+    torch.testing.assert_close(other.d, torch.stack(expected, 1)[found, of_arm], atol=1e-5, rtol=0)
 
 
 def test_no_point_is_described_by_where_a_limb_ends() -> None:

@@ -13,10 +13,11 @@ def test_undistortion_keeps_what_is_absent_absent() -> None:
     assert undistort_points(np.zeros((0, 2)), K, np.array([0.1, 0, 0, 0])).shape == (0, 2)
 
 
-def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:
-    K, distortion = np.array([[1100.0, 0, 960], [0, 1100, 540], [0, 0, 1]]), np.array([-0.25, 0.05, 0, 0])
-    straight = np.array([[100.0, 100], [1800, 60], [960, 540], [200, 1000]])
-    directions = np.c_[(straight - (960, 540)) / 1100, np.ones(4)]
+@pytest.mark.parametrize(("focal_px", "k1", "k2"), [(1100.0, -0.25, 0.05), (870.0, -0.25, 0), (1000.0, -0.2, 0)])
+def test_undistortion_of_a_wide_lens_comes_back_in_the_corners(focal_px: float, k1: float, k2: float) -> None:
+    K, distortion = np.array([[focal_px, 0, 960], [0, focal_px, 540], [0, 0, 1]]), np.array([k1, k2, 0, 0])
+    straight = np.array([[220.5, 105], [1699.5, 975], [1700, 60], [960, 540], [200, 1000]])
+    directions = np.c_[(straight - (960, 540)) / focal_px, np.ones(5)]
     bent = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
     np.testing.assert_allclose(undistort_points(bent, K, distortion), straight, atol=0.01)
 
