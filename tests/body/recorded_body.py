@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
+from hnerf.body.articulation import Pose
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.capture.capture import Capture
@@ -31,6 +32,9 @@ def ring_camera(name: str, angle: float, size_px: int = 256) -> Camera:
     return Camera(name, K, R, -R @ np.array([*(-3 * forward[:2]), 1.0]), size_px, size_px)
 
 
+RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
+
+
 def moving_body(frames: tuple[int, ...]) -> BodyFit:
     """Return a tall, slim person with long shins who swings arms and legs, feet near z = 0."""
     beta = torch.tensor(ADULT)
@@ -49,6 +53,12 @@ def moving_body(frames: tuple[int, ...]) -> BodyFit:
     root[:, 2, 3] = -rig.vertices_m[:, 2].min()
     root[:, 0, 3] = torch.linspace(0, 0.1, len(frames))
     return BodyFit(rig, frames, theta, root)
+
+
+def true_pose(body: BodyFit) -> Pose:
+    """Return the poses of a body in double precision, as a fit has them."""
+    rig, nothing = body.rig.to(dtype=torch.float64), torch.zeros(25, 3, dtype=torch.float64)
+    return Pose(rig, body.theta.double(), body.root.double(), nothing)
 
 
 def record(root: Path, body: BodyFit, cameras: dict[str, Camera], train: tuple[str, ...]) -> Capture:

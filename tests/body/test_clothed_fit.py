@@ -19,10 +19,8 @@ from hnerf.body.pose_prior import Smoothness
 from hnerf.body.rig import joint_transforms
 from hnerf.config import FitSettings
 from hnerf.geometry.silhouette import silhouette
-from tests.body.recorded_body import moving_body, record, ring_camera
+from tests.body.recorded_body import RING, moving_body, record, ring_camera, true_pose
 from tests.body.test_contour_fit import SCALE_M, SEEN_PX, ball, disc
-
-RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
 
 
 def test_neighbours_wear_nearly_the_same() -> None:
@@ -94,8 +92,7 @@ def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pos
     names = tuple(str(k) for k in range(cameras))
     capture = record(folder, truth, {name: RING[name] for name in names}, names)
     seen = observe(capture)
-    nothing = torch.zeros(25, 3, dtype=torch.float64)
-    pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
+    pose = true_pose(truth)
     smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 300.0))
     problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=1)
     faces = truth.rig.faces.numpy()

@@ -25,11 +25,13 @@ from hnerf.body.pose_prior import Smoothness
 from hnerf.body.rig import Rig, joint_transforms
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
-from tests.body.recorded_body import moving_body, record, ring_camera, silhouettes
+from tests.body import recorded_body
+from tests.body.recorded_body import moving_body, record, ring_camera, silhouettes, true_pose
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
+from tests.calibration.synthetic import edited_keypoints
 
-RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)} | {"test": ring_camera("test", 1.0)}
+RING = recorded_body.RING | {"test": ring_camera("test", 1.0)}
 
 
 @pytest.fixture
@@ -75,8 +77,7 @@ def test_a_frame_that_nothing_was_fitted_to_is_poor(tmp_path: Path) -> None:
     capture = record(tmp_path, truth, RING, ("0", "1"))
     seen = observe(capture)
     seen.confidence[:, 1] = 0
-    nothing = torch.zeros(25, 3, dtype=torch.float64)
-    pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
+    pose = true_pose(truth)
     masks = silhouettes(capture, truth)
     reports = [_report(capture, m, seen, pose, truth, {}) for m in (None, masks)]  # type: ignore[arg-type]
     assert [report["keypoint_residual_px"][1] for report in reports] == [None, None]
@@ -152,8 +153,7 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
     capture = record(tmp_path, truth, RING, ("0",))
     seen = observe(capture)
     smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 30.0))
-    nothing = torch.zeros(25, 3, dtype=torch.float64)
-    pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
+    pose = true_pose(truth)
     problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=0.1)
     problem = replace(problem, reshape=pose.rig.reshaped)  # half of a step would be anny's shape
     pose = levenberg_marquardt(problem, pose, problem.image_term, 15)
@@ -178,11 +178,9 @@ def test_keypoints_alone_and_a_lone_frame_that_is_hardly_seen(tmp_path: Path, ca
     """Frame 9 has no neighbours in time, and stays near the others; one camera of four sees it, or none at all."""
     truth = moving_body((0, 1, 9))
     capture = record(tmp_path, truth, RING, cameras)
-    with np.load(tmp_path / "keypoints.npz") as stored:
-        keypoints = {name: found.copy() for name, found in stored.items()}
-    for name in cameras[:1] if len(cameras) == 1 else cameras[1:]:
-        keypoints[name][2] = 0
-    np.savez(tmp_path / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+    with edited_keypoints(tmp_path) as keypoints:
+        for name in cameras[:1] if len(cameras) == 1 else cameras[1:]:
+            keypoints[name][2] = 0
     fit, report = fit_body(capture, None, FitSettings())
     assert fit.frames == truth.frames and fit.root.isfinite().all()
     assert (fit.root[2, :3, 3] - fit.root[1, :3, 3]).norm() < 1.0
@@ -192,10 +190,8 @@ def test_keypoints_alone_and_a_lone_frame_that_is_hardly_seen(tmp_path: Path, ca
 
 def test_a_person_seen_by_too_few_cameras_is_bad_input(tmp_path: Path) -> None:
     capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))
-    with np.load(tmp_path / "keypoints.npz") as stored:
-        keypoints = dict(stored)
-    keypoints["1"][1:, ..., 2] = 0
-    np.savez(tmp_path / "keypoints.npz", **keypoints)
+    with edited_keypoints(tmp_path) as keypoints:
+        keypoints["1"][1:, ..., 2] = 0
     with pytest.raises(InputError, match=r"keypoints.npz: head and trunk .* in only 1 of 3 frames"):
         fit_body(capture, None, FitSettings())
     (tmp_path / "keypoints.npz").unlink()
@@ -205,11 +201,9 @@ def test_a_person_seen_by_too_few_cameras_is_bad_input(tmp_path: Path) -> None:
 
 def test_frames_before_the_person_comes_do_not_count(tmp_path: Path) -> None:
     capture = record(tmp_path, moving_body((0, 1, 2, 3, 4)), RING, ("0", "1"))
-    with np.load(tmp_path / "keypoints.npz") as stored:
-        keypoints = dict(stored)
-    for seen in keypoints.values():
-        seen[:3, ..., 2] = 0
-    np.savez(tmp_path / "keypoints.npz", **keypoints)
+    with edited_keypoints(tmp_path) as keypoints:
+        for seen in keypoints.values():
+            seen[:3, ..., 2] = 0
     assert initial_pose(capture, observe(capture), body_model(FitSettings())).root.isfinite().all()
 
 

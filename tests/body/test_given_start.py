@@ -19,9 +19,8 @@ from hnerf.capture.given_poses import GivenPoses
 from hnerf.config import CalibrationSettings, FitSettings, SegmentationSettings
 from hnerf.segmentation.segment import segment
 from tests.body.made_up_smpl import write_smpl
-from tests.body.recorded_body import moving_body, record, ring_camera, silhouettes
+from tests.body.recorded_body import RING, moving_body, record, ring_camera, silhouettes
 
-RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
 LIMBS = tuple(f"{bone}.{side}" for bone in ("upperarm01", "lowerarm01", "upperleg01", "lowerleg01") for side in "LR")
 ENDS = tuple(f"{end}.{side}" for end in ("lowerarm01", "wrist", "lowerleg01", "foot") for side in "LR")
 

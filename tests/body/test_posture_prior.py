@@ -18,7 +18,7 @@ from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.posture_prior import PosturePrior, view_direction_variance
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.config import FitSettings
-from tests.body.recorded_body import moving_body, record, ring_camera
+from tests.body.recorded_body import moving_body, record, ring_camera, true_pose
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
@@ -166,8 +166,7 @@ def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
     seen = observe(capture)
     noise = torch.randn(seen.pixels.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     seen = replace(seen, pixels=seen.pixels + 2 * noise)
-    offsets_m = torch.zeros(25, 3, dtype=torch.float64)
-    begin = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), offsets_m)
+    begin = true_pose(truth)
     smoothness = Smoothness(runs(capture), 10.0, np.full(25, 30.0))
     problem = make_problem(body_model(settings), begin, seen, smoothness, settings, 1, 0.1)
     return replace(problem, reshape=begin.rig.reshaped), begin  # half of a step would be anny's shape

@@ -18,9 +18,7 @@ from hnerf.capture.given_poses import GivenPoses
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from tests.body.made_up_smpl import LEFT_ELBOW, PARENTS, made_up_smpl, write_smpl
-from tests.body.recorded_body import record, ring_camera
-
-RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
+from tests.body.recorded_body import RING, record
 
 
 @pytest.fixture(scope="module")

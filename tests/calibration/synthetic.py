@@ -1,6 +1,8 @@
 """Synthetic captures: a ring of cameras around a walking stick figure, with everything known."""
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -70,6 +72,15 @@ def write_capture(root: Path, cameras: list[Camera], seen: dict[str, np.ndarray]
     names = tuple(camera.name for camera in cameras)
     by_name = {camera.name: camera for camera in cameras}
     return Capture("ring", root, by_name, names, (), frames, (), 30.0, up, sizes, sizes)
+
+
+@contextmanager
+def edited_keypoints(root: Path) -> Iterator[dict[str, np.ndarray]]:
+    """Let the keypoints in a capture's folder be changed, by camera."""
+    with np.load(root / "keypoints.npz") as stored:
+        found = dict(stored)
+    yield found
+    np.savez(root / "keypoints.npz", **found)
 
 
 def turned(camera: Camera, degrees: float, axis: int = 1) -> Camera:

@@ -11,7 +11,7 @@ from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.subject import ranked_people, subject_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
-from tests.calibration.synthetic import STANDING_M, ring, walk_m, write_capture
+from tests.calibration.synthetic import STANDING_M, edited_keypoints, ring, walk_m, write_capture
 
 _AGREED = people._agreements
 FRAMES, CONFIDENCE, NOISE_PX = 30, 0.8, 1.0
@@ -106,10 +106,8 @@ def test_a_mirror_image_is_not_taken(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     towards = cameras[0].centre_m * [0.3, 0.3, 0]
     mirrored = seen_by(cameras[0], walk_m(FRAMES) * [1, -1, 1] + towards, rng)
-    with np.load(tmp_path / "keypoints.npz") as stored:
-        seen = dict(stored)
-    seen["c0"] = np.stack([mirrored, subject["c0"]], 1)
-    capture = write_capture(tmp_path, cameras, seen)
+    with edited_keypoints(tmp_path) as seen:
+        seen["c0"] = np.stack([mirrored, subject["c0"]], 1)
     assert share_right(subject_keypoints(capture), subject) == 1
 
 
@@ -205,9 +203,7 @@ def test_a_keypoint_that_is_no_place_is_not_seen(tmp_path: Path) -> None:
 def test_a_camera_without_keypoints_is_told_how_to_get_them(tmp_path: Path) -> None:
     """The network is not used by itself, since the other camera's keypoints came with the recording."""
     capture, _ = recorded(tmp_path, ring(2), walk_m())
-    with np.load(tmp_path / "keypoints.npz") as stored:
-        kept = dict(stored)
-    del kept["c1"]
-    np.savez(tmp_path / "keypoints.npz", **kept)
+    with edited_keypoints(tmp_path) as kept:
+        del kept["c1"]
     with pytest.raises(InputError, match=r"camera c1: no keypoints; set detection\.source=network, or detect some"):
         subject_keypoints(capture)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import Capture, write_image
-from tests.calibration.synthetic import STANDING_M, look_at, write_capture
+from tests.calibration.synthetic import STANDING_M, edited_keypoints, look_at, write_capture
 
 SIZE_PX = 400
 FRAMES = 8
@@ -88,6 +88,6 @@ def write_masks(capture: Capture, masks: dict) -> None:
 
 def only_frames(capture: Capture, count: int) -> Capture:
     """Keep the first frames; the others lose their keypoints in the folder, too."""
-    with np.load(capture.root / "keypoints.npz") as stored:
-        np.savez(capture.root / "keypoints.npz", **{name: stored[name][:count] for name in stored.files})
+    with edited_keypoints(capture.root) as found:
+        found |= {name: seen[:count] for name, seen in found.items()}
     return dataclasses.replace(capture, train_frames=tuple(range(count)), novel_pose_frames=())

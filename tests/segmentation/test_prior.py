@@ -13,7 +13,7 @@ from hnerf.segmentation.prior import (
     _stick_figure,
     camera_priors,
 )
-from tests.calibration.synthetic import SIZE_PX, detections, ring, turned, write_capture
+from tests.calibration.synthetic import SIZE_PX, detections, edited_keypoints, ring, turned, write_capture
 from tests.segmentation.scene import write_likely, write_scene
 
 HEAD, LEGS, FEET = [0, 15, 16, 17, 18], [10, 11, 13, 14, *range(19, 25)], list(range(19, 25))
@@ -27,12 +27,10 @@ HIPS = [8, 9, 12]
 )
 def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, unseen: list[int], after: int) -> None:
     capture, truth = write_scene(tmp_path, cameras, moves_m=2.0)
-    with np.load(tmp_path / "keypoints.npz") as stored:
-        found = {name: stored[name] for name in stored.files}
-    found["c0"][after:, :, unseen] = 0
-    if unseen == FEET:
-        found["c1"][:, :, unseen] = 0
-    np.savez(tmp_path / "keypoints.npz", **found)
+    with edited_keypoints(tmp_path) as found:
+        found["c0"][after:, :, unseen] = 0
+        if unseen == FEET:
+            found["c1"][:, :, unseen] = 0
     priors = dict(camera_priors(capture, None, SegmentationSettings()))
     for (camera, frame), person in truth.items():
         assert priors[camera][frame].reach[person].all()
@@ -58,10 +56,8 @@ def test_a_networks_mask_says_where_the_subject_is(tmp_path: Path) -> None:
 
 def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path, 1)
-    with np.load(tmp_path / "keypoints.npz") as stored:
-        found = {name: stored[name] for name in stored.files}
-    found["c0"][0, 0, 4, :2] = 1e7, -1e9
-    np.savez(tmp_path / "keypoints.npz", **found)
+    with edited_keypoints(tmp_path) as found:
+        found["c0"][0, 0, 4, :2] = 1e7, -1e9
     prior = dict(camera_priors(capture, None, SegmentationSettings()))["c0"][0]
     assert 5 * 400 < prior.height_px < 6 * 400  # from 5 heights above the image to the feet in it
     assert prior.reach[truth["c0", 0]].all()
