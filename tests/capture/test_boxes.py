@@ -1,5 +1,6 @@
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -25,31 +26,21 @@ def split(path: Path) -> tuple[bytes, bytes]:
     return content[:start], content[start:]
 
 
-@pytest.mark.parametrize("to_the_end", [False, True])
-def test_more_samples_declared_than_there_are_bytes(video: Path, to_the_end: bool) -> None:
-    """FFmpeg's table of a hundred million would take 2.4 GB. The last box may leave its size out."""
+@pytest.mark.parametrize(
+    "hide",
+    [
+        lambda frames, moov: frames + moov,
+        lambda frames, moov: frames + bytes(4) + moov[4:],  # the last box may leave its size out
+        lambda frames, moov: frames + moov[:4] + b"free" + moov[8:],  # FFmpeg takes it for the header all the same
+        lambda frames, moov: frames + moov.replace(b"stsz", b"stsz" + bytes(4) + b"stsz"),  # a name before a name
+    ],
+)
+def test_more_samples_declared_than_there_are_bytes(video: Path, hide: Callable[[bytes, bytes], bytes]) -> None:
+    """FFmpeg's table of a hundred million would take 2.4 GB."""
     declare_samples(video, 100_000_000)
-    if to_the_end:
-        frames, moov = split(video)
-        video.write_bytes(frames + bytes(4) + moov[4:])
-    with pytest.raises(InputError, match=r"a\.mp4: declares 100000000 samples in \d+ bytes"):
+    video.write_bytes(hide(*split(video)))
+    with pytest.raises(InputError, match=r"a\.mp4: declares \d{9,} samples in \d+ bytes"):
         Video.open(video)
-
-
-def test_a_header_that_is_called_free(video: Path) -> None:
-    """FFmpeg takes it for the header all the same."""
-    declare_samples(video, 100_000_000)
-    frames, moov = split(video)
-    video.write_bytes(frames + moov[:4] + b"free" + moov[8:])
-    with pytest.raises(InputError, match=r"a\.mp4: declares 100000000 samples"):
-        boxes.check_tables(video)
-
-
-def test_a_name_before_a_name_hides_nothing(video: Path) -> None:
-    declare_samples(video, 100_000_000)
-    video.write_bytes(video.read_bytes().replace(b"stsz", b"stsz" + bytes(4) + b"stsz"))
-    with pytest.raises(InputError, match=r"a\.mp4: declares \d+ samples"):
-        boxes.check_tables(video)
 
 
 def test_tracks_count_together(video: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 
 from hnerf.capture.capture import Capture, write_image
-from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
@@ -92,23 +91,13 @@ def test_what_is_of_no_calibrated_camera_is_told(
             write_image(folder / "masks" / camera / "000000.png", rec.picture("01", 0))
         for camera in ("1", "01"):
             write_image(folder / "background" / f"{camera}.png", rec.picture("01", 0))
+        (folder / "keypoints").mkdir()
+        for camera in ("01", "cam02"):
+            (folder / "keypoints" / f"{camera}.json").write_text("[]")
         ingest(folder, SETTINGS, tmp_path / "again")
     assert caplog.messages == [
         f"{folder}/{found} not in the calibration, and not read; rename or remove them"
-        for found in (r"masks: '\n', '1', '2', '5', '6', ...", "background: '1'")
-    ]
-
-
-def test_keypoints_of_no_calibrated_camera_are_told(
-    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    (folder / "keypoints").mkdir()
-    for camera in ("01", "cam02"):
-        (folder / "keypoints" / f"{camera}.json").write_text("[]")
-    with caplog.at_level(logging.WARNING, "hnerf.capture"):
-        ingest(folder, SETTINGS, tmp_path / "out")
-    assert caplog.messages == [
-        f"{folder}/keypoints: 'cam02' not in the calibration, and not read; rename or remove them"
+        for found in ("keypoints: 'cam02'", r"masks: '\n', '1', '2', '5', '6', ...", "background: '1'")
     ]
 
 
@@ -118,15 +107,11 @@ def test_a_folder_of_plates_is_refused(folder: Path, tmp_path: Path) -> None:
         ingest(folder, SETTINGS, tmp_path / "out")
 
 
-def test_long_recordings_are_strided_evenly(folder: Path, tmp_path: Path) -> None:
-    assert ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out").train_frames == (0, 2, 4)
-
-
-def test_how_many_frames_of_a_long_recording_are_taken_is_told(
+def test_long_recordings_are_strided_evenly_and_it_is_told(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.INFO, "hnerf.capture"):
-        ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out")
+        assert ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out").train_frames == (0, 2, 4)
         assert "3 of 5 frames taken, one in 2; name others in capture.toml" in caplog.text
         caplog.clear()
         ingest(folder, CaptureSettings(max_frames=5), tmp_path / "all")
@@ -282,14 +267,6 @@ def test_keypoints_may_be_called_as_openpose_calls_them(folder: Path, tmp_path: 
     for path in folder.glob("openpose/*/*"):
         path.rename(path.with_name(f"{prefix}{int(path.stem[:6]):012d}_keypoints.json"))
     assert np.array_equal(ingest(folder, SETTINGS, tmp_path / "out").keypoints("01"), plain)
-
-
-def test_numbers_without_zeros_before_them_are_sorted_as_numbers(tmp_path: Path) -> None:
-    folder = rec.write_pose2sim(tmp_path / "walker")
-    for path in (folder / "pose" / "cam01_json").iterdir():
-        path.rename(path.with_stem(f"cam01_{int(path.stem[-6:]) + 5}"))  # 5 to 14
-    files = Pose2Sim(folder).keypoint_files("cam01")
-    assert [str(files[i]).rsplit("_", 1)[1] for i in (0, 4, 5, 9)] == ["5.json", "9.json", "10.json", "14.json"]
 
 
 def test_videos_are_read_by_frame(tmp_path: Path) -> None:

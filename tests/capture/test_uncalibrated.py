@@ -28,26 +28,23 @@ def write_images(folder: Path, camera: str, exif: Image.Exif | None = None) -> N
         Image.new("RGB", (200, 100)).save(place / f"{frame:06d}.jpg", exif=exif or Image.Exif())
 
 
-def test_a_field_of_view_gives_the_focal_length(tmp_path: Path) -> None:
-    write_images(tmp_path, "a")
-    known = Uncalibrated(tmp_path, fov_deg=90).known_lenses["a"]
-    assert np.allclose(known.lens.K, [[100, 0, 99.5], [0, 100, 49.5], [0, 0, 1]])  # half of 200 / tan 45
-    assert known.source == "90 degrees given"
-
-
-def test_without_anything_the_focal_length_is_a_guess(tmp_path: Path) -> None:
-    write_images(tmp_path, "a")
-    known = Uncalibrated(tmp_path).known_lenses["a"]
-    assert known.lens.K[0, 0] == pytest.approx(170) and not known.source
-
-
-def test_exif_gives_the_focal_length(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("fov_deg", "focal_mm", "focal_px", "source"),
+    [
+        (90, 26, 100, "90 degrees given"),  # half of 200 / tan 45
+        (None, 26, 26 / 43.27 * np.hypot(200, 100), "26 mm, metadata"),
+        (None, None, 170, ""),  # a guess
+    ],
+)
+def test_an_angle_given_or_metadata_or_a_guess_makes_the_lens(
+    fov_deg: float | None, focal_mm: int | None, focal_px: float, source: str, tmp_path: Path
+) -> None:
     exif = Image.Exif()
-    exif[0x8769] = {0xA405: 26}
+    exif[0x8769] = {0xA405: focal_mm} if focal_mm else {}
     write_images(tmp_path, "a", exif)
-    known = Uncalibrated(tmp_path).known_lenses["a"]
-    assert known.lens.K[0, 0] == pytest.approx(26 / 43.27 * np.hypot(200, 100))
-    assert known.source == "26 mm, metadata"
+    known = Uncalibrated(tmp_path, fov_deg=fov_deg).known_lenses["a"]
+    assert np.allclose(known.lens.K, [[focal_px, 0, 99.5], [0, focal_px, 49.5], [0, 0, 1]])
+    assert known.source == source
 
 
 def apple_metadata(focal_mm: int) -> bytes:
