@@ -22,7 +22,7 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
 from hnerf.segmentation.backends import AROUND_DETECTED, BackgroundSubtraction
-from hnerf.segmentation.prior import priors_of
+from hnerf.segmentation.prior import keypoint_priors
 from hnerf.side_by_side import side_by_side
 
 FRAMES = 8  # enough to tell that a camera is wrong
@@ -280,6 +280,6 @@ def _masks(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[i
     if all(mask is not None for mask in given):
         return [mask for mask in given if mask is not None]
     settings = SegmentationSettings()
-    priors = priors_of(capture, name, keypoints, settings)
-    backend = BackgroundSubtraction.of(capture, name, priors, PLATE_FRAMES, AROUND_DETECTED, settings)
-    return [backend.mask(capture.frames[i], priors[i]) for i in shown]
+    prior_of = keypoint_priors(capture, name, keypoints, settings)
+    backend = BackgroundSubtraction.of(capture, name, prior_of, PLATE_FRAMES, AROUND_DETECTED, settings)
+    return [backend.mask(capture.frames[i], prior_of(i)) for i in shown]

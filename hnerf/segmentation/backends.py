@@ -1,6 +1,5 @@
 """Four sources of masks behind one interface: given, learned, against a clean plate, against a median over time."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +11,7 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.segmentation.cut import components_within, cut
 from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, visible_background
 from hnerf.segmentation.learned import Network
-from hnerf.segmentation.prior import Prior, bounding_window
+from hnerf.segmentation.prior import Prior, PriorOf, bounding_window
 
 CLEAN_PLATE = "clean plate"
 AROUND_BODY, AROUND_DETECTED = "median around the fitted body", "median around the detected person"
@@ -68,16 +67,16 @@ class BackgroundSubtraction:
 
     @staticmethod
     def of(
-        capture: Capture, camera: str, priors: Sequence[Prior], count: int, around: str, settings: SegmentationSettings
+        capture: Capture, camera: str, prior_of: PriorOf, count: int, around: str, settings: SegmentationSettings
     ) -> "BackgroundSubtraction":
         """Use the clean plate, which is known everywhere, if there is one, else the median over at most `count` frames,
-        each where its prior leaves the background free; priors are in the order of the frames."""
+        each where its prior leaves the background free."""
         plate = capture.background(camera)
         if plate is not None:
             return BackgroundSubtraction(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
-        chosen = evenly_spaced(range(len(priors)), count)
+        chosen = evenly_spaced(range(len(capture.frames)), count)
         images = [capture.image(camera, capture.frames[i]) for i in chosen]
-        plate, known = masked_median(images, [priors[i].near for i in chosen])
+        plate, known = masked_median(images, [prior_of(i).near for i in chosen])
         return BackgroundSubtraction(capture, camera, plate, known, settings, around)
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
@@ -98,13 +97,13 @@ Backend = Given | Learned | BackgroundSubtraction  # a source of masks for one c
 
 
 def choose_backend(
-    capture: Capture, camera: str, priors: Sequence[Prior], fitted: bool, network: Network | None,
+    capture: Capture, camera: str, prior_of: PriorOf, fitted: bool, network: Network | None,
     settings: SegmentationSettings,
 ) -> Backend:  # fmt: skip
     """Return the first possible source of masks: given masks, the user's network, a clean plate, then the background
     around a `fitted` body or a detected person.
 
-    priors: in the order of the capture's frames. Raises InputError where none is possible.
+    Raises InputError where none is possible.
     """
     if any(capture.given_mask(camera, frame) is not None for frame in capture.frames):
         return Given(capture, camera)
@@ -115,4 +114,4 @@ def choose_backend(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
     around = AROUND_BODY if fitted else AROUND_DETECTED
-    return BackgroundSubtraction.of(capture, camera, priors, MEDIAN_FRAMES, around, settings)
+    return BackgroundSubtraction.of(capture, camera, prior_of, MEDIAN_FRAMES, around, settings)

@@ -83,23 +83,14 @@ class Prior:
         return Prior(core, body, near, reach, self.height_px, self.behind)
 
 
-class Priors(Sequence[Prior]):
-    """The priors of one camera in the order of `capture.frames`, each made whenever it is asked for: those of a long
-    recording do not fit into memory together."""
-
-    def __init__(self, make: Callable[[int], Prior], frames: int) -> None:
-        self._make, self._numbers = make, range(frames)
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def __getitem__(self, number: int) -> Prior:  # type: ignore[override]
-        return self._make(self._numbers[number])
+PriorOf = Callable[[int], Prior]
+"""Makes the prior of the frame of this number among `capture.frames`: those of a long recording do not fit into memory
+together."""
 
 
 def camera_priors(
     capture: Capture, body: BodyFit | None, settings: SegmentationSettings
-) -> Iterator[tuple[str, Priors]]:
+) -> Iterator[tuple[str, PriorOf]]:
     """Yield each training camera with the priors of the fitted body, else of what a network took for a person, either
     together with the stick figure, which it may miss; else of the stick figure alone."""
     prior: Callable[..., Prior] = _network_prior if capture.has_person_masks else _keypoint_prior
@@ -107,13 +98,13 @@ def camera_priors(
         vertices_m = body.vertices_m().numpy()[[body.index(f) for f in capture.frames]]
         prior = partial(_body_prior, vertices_m=vertices_m, faces=body.rig.faces.numpy())
     for name, poses_px in _consistent_keypoints(capture, body).items():
-        yield name, Priors(partial(prior, capture, name, poses_px, settings.reach), len(poses_px))
+        yield name, partial(prior, capture, name, poses_px, settings.reach)
 
 
-def priors_of(capture: Capture, camera: str, keypoints: np.ndarray, settings: SegmentationSettings) -> Priors:
+def keypoint_priors(capture: Capture, camera: str, keypoints: np.ndarray, settings: SegmentationSettings) -> PriorOf:
     """Return the priors of a person's stick figures in one camera, seen as keypoints (frames, 25, 3)."""
     poses_px = _interpolated(np.where(keypoints[..., 2:] > 0, keypoints[..., :2], np.nan), capture.frames)
-    return Priors(partial(_keypoint_prior, capture, camera, poses_px, settings.reach), len(poses_px))
+    return partial(_keypoint_prior, capture, camera, poses_px, settings.reach)
 
 
 def _keypoint_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:

@@ -15,7 +15,7 @@ from hnerf.errors import InputError
 from hnerf.progress import tracked
 from hnerf.segmentation.backends import Backend, choose_backend
 from hnerf.segmentation.learned import Network
-from hnerf.segmentation.prior import Priors, camera_priors
+from hnerf.segmentation.prior import PriorOf, camera_priors
 from hnerf.segmentation.verdicts import MaskVerdict, area_jumps, judge_mask
 from hnerf.side_by_side import side_by_side
 
@@ -34,11 +34,11 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}
-    for name, own in tracked(priors, "segmentation", len(capture.train_cameras)):
-        backend = choose_backend(capture, name, own, body is not None, network, settings)
+    for name, prior_of in tracked(priors, "segmentation", len(capture.train_cameras)):
+        backend = choose_backend(capture, name, prior_of, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
         verdicts, bodies_px = [], []
-        looks = side_by_side(partial(_look, capture, backend, own), range(len(own)))
+        looks = side_by_side(partial(_look, capture, backend, prior_of), range(len(capture.frames)))
         for frame, look in zip(capture.frames, looks, strict=True):
             verdicts.append(look.verdict)
             bodies_px.append(look.body_px)
@@ -57,8 +57,8 @@ class _Look(NamedTuple):
     body_px: int
 
 
-def _look(capture: Capture, backend: Backend, priors: Priors, number: int) -> _Look:
-    prior = priors[number]
+def _look(capture: Capture, backend: Backend, prior_of: PriorOf, number: int) -> _Look:
+    prior = prior_of(number)
     mask = backend.mask(capture.frames[number], prior)
     return _Look(encode(mask), judge_mask(mask, prior), int(prior.body.sum()))
 

@@ -33,7 +33,7 @@ def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, un
             found["c1"][:, :, unseen] = 0
     priors = dict(camera_priors(capture, None, SegmentationSettings()))
     for (camera, frame), person in truth.items():
-        assert priors[camera][frame].reach[person].all()
+        assert priors[camera](frame).reach[person].all()
 
 
 def test_a_networks_mask_says_where_the_subject_is(tmp_path: Path) -> None:
@@ -44,21 +44,21 @@ def test_a_networks_mask_says_where_the_subject_is(tmp_path: Path) -> None:
     write_likely(capture, truth | {("c0", 3): np.zeros_like(truth["c0", 3])})
     found = dict(camera_priors(capture, None, SegmentationSettings()))
     for (camera, frame), person in truth.items():
-        prior = found[camera][frame]
+        prior = found[camera](frame)
         if (camera, frame) == ("c0", 3):
-            assert np.array_equal(prior.body, sticks[camera][frame].body)
+            assert np.array_equal(prior.body, sticks[camera](frame).body)
             continue
         assert (prior.body & person).sum() / (prior.body | person).sum() > 0.9
         assert (prior.core & ~person).sum() < 0.001 * person.sum() < prior.core.sum() / 200  # a hole that the blur shut
         assert not prior.reach[:40, :30].any()
-        assert prior.reach.sum() < 0.8 * sticks[camera][frame].reach.sum()
+        assert prior.reach.sum() < 0.8 * sticks[camera](frame).reach.sum()
 
 
 def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path, 1)
     with edited_keypoints(tmp_path) as found:
         found["c0"][0, 0, 4, :2] = 1e7, -1e9
-    prior = dict(camera_priors(capture, None, SegmentationSettings()))["c0"][0]
+    prior = dict(camera_priors(capture, None, SegmentationSettings()))["c0"](0)
     assert 5 * 400 < prior.height_px < 6 * 400  # from 5 heights above the image to the feet in it
     assert prior.reach[truth["c0", 0]].all()
 
@@ -78,7 +78,7 @@ def test_nobody_is_where_a_camera_looks_away(tmp_path: Path) -> None:
     stranger = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     stranger[300:900, 400:600] = 255
     write_image(tmp_path / "masks" / "c2" / "000000.png", stranger)
-    prior = dict(camera_priors(capture, None, SegmentationSettings()))["c2"][0]
+    prior = dict(camera_priors(capture, None, SegmentationSettings()))["c2"](0)
     assert prior.elsewhere and not Given(capture, "c2").mask(0, prior).any()
 
 
