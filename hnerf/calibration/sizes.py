@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera, resampling
@@ -9,15 +10,11 @@ from hnerf.geometry.camera import Camera, resampling
 SizeChange = Callable[[Camera, tuple[int, int], tuple[int, int]], Camera]
 
 
-def _crop_or_pad(share: float) -> SizeChange:
-    """Return the change of cropping or padding, with this share of the size difference on the left and at the top."""
-
-    def change(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
-        per_recorded = camera.width_px / recorded_px[0]
-        dx, dy = (share * per_recorded * (r - c) for r, c in zip(recorded_px, calibrated_px, strict=True))
-        return dataclasses.replace(camera, K=resampling(1.0, 1.0, dx, dy) @ camera.K)
-
-    return change
+def _crop_or_pad(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int], share: float) -> Camera:
+    """Return the camera of a cropped or padded picture, with this share of the size difference on the left and top."""
+    per_recorded = camera.width_px / recorded_px[0]
+    dx, dy = (share * per_recorded * (r - c) for r, c in zip(recorded_px, calibrated_px, strict=True))
+    return dataclasses.replace(camera, K=resampling(1.0, 1.0, dx, dy) @ camera.K)
 
 
 def _stretch(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
@@ -34,8 +31,8 @@ def _scale_and_pad(camera: Camera, calibrated_px: tuple[int, int], recorded_px: 
 
 # Cropping or padding on the right and at the bottom is not among them: it leaves K as it is.
 SIZE_CHANGES: dict[str, SizeChange] = {
-    "cropped or padded symmetrically": _crop_or_pad(0.5),
-    "cropped or padded on the left or at the top": _crop_or_pad(1.0),
+    "cropped or padded symmetrically": partial(_crop_or_pad, share=0.5),
+    "cropped or padded on the left or at the top": partial(_crop_or_pad, share=1.0),
     "stretched": _stretch,
     "scaled and padded symmetrically": _scale_and_pad,
 }
