@@ -60,9 +60,9 @@ MAX_MISPLACED_SHARE = 0.5  # of keypoints outside their images, where detectors 
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
     PeopleSnapshot,
+    EasyMocap,
     Colmap,
     Caliscope,
-    EasyMocap,
     Pose2Sim,
     Videos,
 )  # the first that recognises a folder

@@ -26,7 +26,7 @@ class Caliscope(EasyMocap):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         """Return whether the folder looks like this layout."""
-        return not EasyMocap.recognises(folder) and any((folder / name).exists() for name in FILES)
+        return any((folder / name).exists() for name in FILES)
 
     def lenses(self) -> dict[str, Lens]:
         """Return every camera that the file calibrates and does not ignore."""

@@ -57,10 +57,7 @@ class _Optics(NamedTuple):
 class Colmap(EasyMocap):
     """A capture folder with a COLMAP model in sparse/0 (or sparse/); its unit of length is arbitrary."""
 
-    @classmethod
-    def recognises(cls, folder: Path) -> bool:
-        """Return whether the folder looks like this layout."""
-        return (folder / "sparse").is_dir() and not EasyMocap.recognises(folder)
+    mark = "sparse/"
 
     def lenses(self) -> dict[str, Lens]:
         """Return one camera for each image of the model."""

@@ -25,7 +25,7 @@ class StoredFrame(NamedTuple):
 class Layout(ABC):
     """A capture folder in one layout. Methods for what most layouts lack return nothing by default.
 
-    `mark`: a file that only this layout has; its name may have wildcards.
+    `mark`: a file, or a folder with a slash behind, that only this layout has; its name may have wildcards.
     `novel_pose_share`: share of the frames for novel poses, where no `capture.toml` splits them.
     """
 
