@@ -41,10 +41,12 @@ def cameras_without_calibration(folder: Path) -> list[str]:
     folders = [path for path in sorted(images.iterdir()) if path.is_dir()] if images.is_dir() else []
     if folders:
         return [check_camera_name(path.name, path) for path in folders]
-    for place in (("videos",), ()):
-        if videos := files_in(folder, *place, suffixes=VIDEO_SUFFIXES):
-            return list(by_camera(videos))
-    return []
+    return list(by_camera(videos_in(folder)))
+
+
+def videos_in(folder: Path) -> list[Path]:
+    """Return the videos in videos/, else those in the folder."""
+    return files_in(folder, "videos", suffixes=VIDEO_SUFFIXES) or files_in(folder, suffixes=VIDEO_SUFFIXES)
 
 
 @dataclass(frozen=True)

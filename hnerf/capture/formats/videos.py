@@ -11,8 +11,8 @@ from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import read_manifest
-from hnerf.capture.safe_io import VIDEO_SUFFIXES, check_camera_name, files_in, path_in_capture
-from hnerf.capture.uncalibrated import USUAL_FOCAL, lens_by_angle
+from hnerf.capture.safe_io import VIDEO_SUFFIXES, check_camera_name, path_in_capture
+from hnerf.capture.uncalibrated import USUAL_FOCAL, lens_by_angle, videos_in
 from hnerf.errors import InputError
 from hnerf.geometry.axes import CAMERA_FROM_Z_UP
 
@@ -74,7 +74,5 @@ def _camera_name(video: Path) -> str:
 
 
 def _videos(folder: Path) -> list[Path]:
-    """Return the file itself if it is a video, else the videos in videos/, else those in the folder."""
-    if folder.is_file():
-        return [folder] if folder.suffix.lower() in VIDEO_SUFFIXES else []
-    return files_in(folder, "videos", suffixes=VIDEO_SUFFIXES) or files_in(folder, suffixes=VIDEO_SUFFIXES)
+    """Return the file itself if it is a video, else those of the folder."""
+    return [folder] if folder.is_file() and folder.suffix.lower() in VIDEO_SUFFIXES else videos_in(folder)
