@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from hnerf.body.anny import BETA_NAMES, anny_model
+from hnerf.body.anny import anny_model
 from hnerf.body.rig import Rig
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
@@ -16,10 +16,8 @@ LEAST_M = 1e-5  # that a unit moves some vertex of the skin by; the tongue's mov
 
 
 def face_units_m(rig: Rig) -> dict[str, np.ndarray]:
-    """Return how far each unit moves the vertices of a rig's skin at rest, (V, 3) float32, by its name, scaled to the
-    size of the rig's face. Only anny's body has units."""
-    if rig.beta_names != BETA_NAMES:
-        return {}
+    """Return how far each unit moves the vertices of anny's skin at rest, (V, 3) float32, by its name, scaled to the
+    size of the rig's face."""
     units, template = _template_units_m(), anny_model().template_vertices.double().numpy()
     face = np.any([np.abs(moved).max(1) > LEAST_M for moved in units.values()], 0)
     before, after = template[face], rig.vertices_m.double().numpy()[face]

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from hnerf.body.anny import ADULT, BETA_NAMES, LOCAL_CHANGES, PHENOTYPES, anny_rig
+from hnerf.body.anny import ADULT, LOCAL_CHANGES, PHENOTYPES, anny_rig
 from hnerf.body.rig import Rig
 
 MUSCLE, WEIGHT = PHENOTYPES.index("muscle"), PHENOTYPES.index("weight")
@@ -11,15 +11,13 @@ PHYSIQUES = {"heavy": (0.0, 1.0), "muscular": (1.0, 1.0), "slim": (0.0, 0.0)}  #
 
 
 def physiques_m(rig: Rig) -> dict[str, np.ndarray]:
-    """Return how far each physique moves the vertices of a rig's skin at rest, (V, 3) float32, by its name, with the
-    joints where they are. Only anny's body has physiques.
+    """Return how far each physique moves the vertices of anny's skin at rest, (V, 3) float32, by its name, with the
+    joints where they are.
 
     What moves is the difference between two bodies of the rig's gender, age, height and proportions: of this muscle
     and weight, and of average ones. The rig's own muscle and weight are not used: the fit trades them against local
     changes. The joints differ between the two by up to 3 cm; what their skin weights make of that is taken out.
     """
-    if rig.beta_names != BETA_NAMES:
-        return {}
     average = _of(rig, ADULT[MUSCLE], ADULT[WEIGHT])
     moved = {}
     for name, (muscle, weight) in PHYSIQUES.items():

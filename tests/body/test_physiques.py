@@ -53,6 +53,6 @@ def test_eyeballs_do_not_move_and_other_bodies_have_no_physiques(rig: Rig) -> No
     assert base.physiques_m["slim"].shape == (len(base.rig.vertices_m), 3)
     assert not base.physiques_m["slim"][len(rig.vertices_m) :].any()
     np.testing.assert_array_equal(base.physiques_m["slim"][: len(rig.vertices_m)], physiques_m(rig)["slim"])
-    assert physiques_m(column_rig()) == {} == base_mesh(column_rig()).physiques_m
+    assert base_mesh(column_rig()).physiques_m == {}
     renamed = dataclasses.replace(rig, beta_names=tuple(f"b{k}" for k in range(len(rig.beta))))
-    assert physiques_m(renamed) == {}
+    assert base_mesh(renamed).physiques_m == {}
