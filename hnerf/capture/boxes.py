@@ -16,12 +16,11 @@ FRAGMENT_SAMPLES = re.compile(rb"trun(?=.{4}(.{4}))", re.DOTALL)
 EDITS = re.compile(rb"elst(?=.{4}(.{4}))", re.DOTALL)
 
 
-def top_box(path: Path, wanted: bytes, most_bytes: int) -> bytes:
-    """Return the content of a file's first box of this kind; empty where there is none, or a larger one."""
-    for kind, start, size_bytes in _top_boxes(path):
-        if kind == wanted:
-            return _content(path, start, size_bytes) if size_bytes <= most_bytes else b""
-    return b""
+def movie_boxes(path: Path, most_bytes: int) -> list[tuple[bytes, bytes]]:
+    """Return kind and content of the boxes in a file's first `moov`; none where there is none, or a larger one."""
+    movies = ((start, size_bytes) for kind, start, size_bytes in _top_boxes(path) if kind == b"moov")
+    start, size_bytes = next(movies, (0, 0))
+    return list(boxes(_content(path, start, size_bytes))) if size_bytes <= most_bytes else []
 
 
 def boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:

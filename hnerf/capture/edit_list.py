@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hnerf.capture.boxes import MAX_TABLES_BYTES, boxes, top_box
+from hnerf.capture.boxes import MAX_TABLES_BYTES, boxes, movie_boxes
 
 MAX_EDITS = 1000
 NOTHING = -1  # in place of a time: an edit that shows nothing
@@ -18,7 +18,7 @@ INSIDE = (b"mdia", b"minf", b"stbl", b"edts")
 def shown_frames(path: Path, samples: int) -> int:
     """Return how many frames FFmpeg shows of a video's track of this many samples: those within its edit list; all
     where it has none that can be read."""
-    movie = list(boxes(top_box(path, b"moov", MAX_TABLES_BYTES)))
+    movie = movie_boxes(path, MAX_TABLES_BYTES)
     tracks = [_leaves(content) for kind, content in movie if kind == b"trak"]
     videos = [track for track in tracks if track.get(b"hdlr", b"")[8:12] == b"vide"]
     try:

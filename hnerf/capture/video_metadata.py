@@ -5,7 +5,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from hnerf.capture.boxes import boxes, top_box
+from hnerf.capture.boxes import boxes, movie_boxes
 from hnerf.capture.safe_io import VIDEO_SUFFIXES
 
 EXIF_IFD, EXIF_FOCAL_35MM = 0x8769, 0xA405
@@ -35,7 +35,7 @@ def _of_image(path: Path) -> float | None:
 def _of_video(path: Path) -> float | None:
     """Return the value of Apple's key in moov/meta, else in moov/trak/meta of the first track that has it (QuickTime
     File Format, "Metadata")."""
-    movie = list(boxes(top_box(path, b"moov", MAX_METADATA_BYTES)))
+    movie = movie_boxes(path, MAX_METADATA_BYTES)
     tracks = [box for kind, content in movie if kind == b"trak" for box in boxes(content)]
     found = (_stated(content) for kind, content in movie + tracks if kind == b"meta")
     return next((value for value in found if value is not None), None)
