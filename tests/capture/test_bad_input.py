@@ -107,7 +107,7 @@ EASYMOCAP = {
         lambda f: [p.unlink() for p in (f / "images/02").iterdir()],
         "add them, or leave the camera out of [cameras] in capture.toml",
     ),
-    "unequal frame counts": (lambda f: (f / "images/02/000004.png").unlink(), "images/02: 4 frames"),
+    "unequal frame counts": (lambda f: (f / "images/02/000002.png").unlink(), "02: 4 frames, but camera 01 has 5"),
     "frame without a number": (lambda f: (f / "images/01/000001.png").rename(f / "images/01/a.png"), "images/01/a.png"),
     "unreadable image": (lambda f: (f / "images/01/000001.png").write_bytes(b"nothing"), "images/01/000001.png"),
     "image cut short": (lambda f: os.truncate(f / "images/01/000001.png", 700), "images/01/000001.png"),
