@@ -15,7 +15,6 @@ import logging
 import multiprocessing
 import multiprocessing.connection
 import os
-import pickle
 import random
 import re
 import resource
@@ -31,7 +30,6 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(1, str(Path(__file__).parents[1] / "benchmarks"))
 
-import h5py
 import numpy as np
 from peak_memory import peak_mib, reset_peak
 from PIL import ExifTags, Image
@@ -47,6 +45,8 @@ from hnerf.render.motion import _read_amass
 from hnerf.render.trajectory import read_camera_path
 from tasks.store import Store
 from tests.capture import recordings as rec
+from tests.capture.formats.test_camera_files import to_binary
+from tests.capture.formats.test_peoplesnapshot import write_peoplesnapshot
 from tests.capture.formats.test_zjumocap import write_parameters, write_zju
 
 MAX_SECONDS, MAX_MIB, HANG_S = 2.0, 477, 20.0
@@ -115,13 +115,8 @@ def _with_cameras(kind: str) -> Callable[[Path], None]:
 
 
 def _colmap_binary(folder: Path) -> None:
-    import pycolmap
-
     _with_cameras("colmap")(folder)
-    model = folder / "sparse" / "0"
-    pycolmap.Reconstruction(str(model)).write_binary(str(model))
-    for path in model.glob("*.txt"):
-        path.unlink()
+    to_binary(folder / "sparse" / "0")
 
 
 def _boards(folder: Path) -> None:
@@ -145,19 +140,7 @@ def _zju(folder: Path) -> None:
 
 
 def _peoplesnapshot(folder: Path) -> None:
-    rec.write_video(folder / "ada.mp4", FRAMES, (32, 32))
-    camera = {"camera_f": np.array([50.0, 50]), "camera_c": np.array([15.5, 15.5]), "camera_k": np.zeros(5)}
-    camera |= {"camera_t": np.zeros(3), "camera_rt": np.zeros(3), "width": 32, "height": 32}
-    (folder / "camera.pkl").write_bytes(pickle.dumps(camera, 2))
-    files = {
-        "masks": {"masks": np.ones((FRAMES, 32, 32), np.uint8)},
-        "keypoints": {"keypoints": np.tile([5.0, 6.0, 0.8], (FRAMES, 18))},
-        "reconstructed_poses": {"pose": np.ones((2, 72)), "trans": np.ones((2, 3)), "betas": np.zeros(10)},
-    }
-    for name, arrays in files.items():
-        with h5py.File(folder / f"{name}.hdf5", "w") as file:
-            for key, array in arrays.items():
-                file.create_dataset(key, data=array, chunks=True, compression="gzip")
+    write_peoplesnapshot(folder, FRAMES, (32, 32))
 
 
 def _videos(folder: Path) -> None:

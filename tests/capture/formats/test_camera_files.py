@@ -45,10 +45,15 @@ def write_model(folder: Path, binary: bool = False) -> Path:
     (model / "images.txt").write_text(IMAGES_TXT)
     if binary:
         (model / "points3D.txt").write_text("")
-        pycolmap.Reconstruction(str(model)).write_binary(str(model))
-        for path in model.glob("*.txt"):
-            path.unlink()
+        to_binary(model)
     return folder
+
+
+def to_binary(model: Path) -> None:
+    """Replace the text files of a model by binary ones."""
+    pycolmap.Reconstruction(str(model)).write_binary(str(model))
+    for path in model.glob("*.txt"):
+        path.unlink()
 
 
 @pytest.mark.parametrize("binary", [False, True])

@@ -20,27 +20,31 @@ from tests.capture import recordings as rec
 def write_hdf5(path: Path, **arrays: np.ndarray) -> None:
     with h5py.File(path, "w") as file:
         for name, array in arrays.items():
-            file.create_dataset(name, data=array, chunks=True, compression="lzf")
+            file.create_dataset(name, data=array, chunks=True, compression="gzip")
+
+
+def write_peoplesnapshot(folder: Path, frames: int, size_px: tuple[int, int]) -> Path:
+    """Write a recording; row i of the poses, of which there is one more, holds i, so that frame f has row f + 1; the
+    last was never reconstructed."""
+    width, height = size_px
+    rec.write_video(folder / f"{folder.name}.mp4", frames, size_px)
+    camera = {"camera_f": np.array([50.0, 50]), "camera_c": (np.array(size_px) - 1) / 2, "camera_k": np.zeros(5)}
+    camera |= {"camera_t": np.zeros(3), "camera_rt": np.zeros(3), "width": width, "height": height}
+    (folder / "camera.pkl").write_bytes(pickle.dumps(camera, 2))
+    masks = np.zeros((frames, height, width), np.uint8)
+    masks[:, 10:20, 20:30] = 1
+    write_hdf5(folder / "masks.hdf5", masks=masks)
+    keypoints = np.stack([np.arange(18.0), 2 * np.arange(18.0), np.full(18, 0.8)], -1).ravel()
+    write_hdf5(folder / "keypoints.hdf5", keypoints=np.tile(keypoints, (frames, 1)))
+    pose, trans = np.tile(np.arange(frames + 1.0)[:, None], (1, 72)), np.tile([0.1, 0.2, 2.5], (frames + 1, 1))
+    pose[frames], trans[frames] = 0, 0
+    write_hdf5(folder / "reconstructed_poses.hdf5", pose=pose, trans=trans, betas=np.arange(10.0))
+    return folder
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Write a recording of 64 x 48 px; row i of the seven poses holds i, so that frame f has row f + 1; the last was
-    never reconstructed."""
-    folder = tmp_path / "female-1"
-    rec.write_video(folder / "female-1.mp4", 6)
-    camera = {"camera_f": np.array([50.0, 50]), "camera_c": np.array([31.5, 23.5]), "camera_k": np.zeros(5)}
-    camera |= {"camera_t": np.zeros(3), "camera_rt": np.zeros(3), "width": 64, "height": 48}
-    (folder / "camera.pkl").write_bytes(pickle.dumps(camera, 2))
-    masks = np.zeros((6, 48, 64), np.uint8)
-    masks[:, 10:20, 30:40] = 1
-    write_hdf5(folder / "masks.hdf5", masks=masks)
-    keypoints = np.stack([np.arange(18.0), 2 * np.arange(18.0), np.full(18, 0.8)], -1).ravel()
-    write_hdf5(folder / "keypoints.hdf5", keypoints=np.tile(keypoints, (6, 1)))
-    pose, trans = np.tile(np.arange(7.0)[:, None], (1, 72)), np.tile([0.1, 0.2, 2.5], (7, 1))
-    pose[6], trans[6] = 0, 0
-    write_hdf5(folder / "reconstructed_poses.hdf5", pose=pose, trans=trans, betas=np.arange(10.0))
-    return folder
+    return write_peoplesnapshot(tmp_path / "female-1", 6, (64, 48))
 
 
 @pytest.fixture
@@ -67,7 +71,7 @@ def test_keypoints_are_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_masks_and_keypoints(capture: Capture) -> None:
     mask, keypoints = capture.given_mask("camera", 3), capture.keypoints("camera")
-    assert mask is not None and mask[10:20, 30:40].all() and mask.sum() == 100
+    assert mask is not None and mask[10:20, 20:30].all() and mask.sum() == 100
     assert keypoints is not None and keypoints[5, 0, 1].tolist() == [1, 2, 0.8]  # the neck
     assert keypoints[5, 0, 8] == pytest.approx([9.5, 19, 0.8])  # the middle of hips 8 and 11
     assert not keypoints[..., 19:, :].any()
