@@ -22,7 +22,7 @@ from hnerf.body.ground import Ground
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
-from hnerf.body.rig import Rig, joint_transforms
+from hnerf.body.rig import joint_transforms
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from tests.body import recorded_body
@@ -231,21 +231,17 @@ def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> N
     capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))
     rig, seen = two_bone_rig(), observe(capture)
 
-    def reshape(beta: torch.Tensor) -> Rig:
-        vertices_m, joints_m = rig.shaped(beta)
-        return replace(rig, beta=beta, vertices_m=vertices_m, joints_m=joints_m)
-
     pose, one = random_pose(rig, 3), torch.ones(1, dtype=torch.float64)
     likely = FitPriors(0.02, 0.5, 0.02, 2.0, 0.1, 0 * one, one, -9 * one, 9 * one)
     rough = Smoothness([(0, 1, 2)], 25.0, np.full(25, 1e9))
-    problem = Problem(seen, metres_per_pixel(seen.cameras, pose), likely, rough, reshape)
+    problem = Problem(seen, metres_per_pixel(seen.cameras, pose), likely, rough, rig.reshaped)
     generator = torch.Generator().manual_seed(0)
     frame, shared = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in ((3, 9), (76,)))
     ends = []
     for step in (1e-6, -1e-6):
         end = Articulation(rig).apply_step(pose, step * frame)
         offsets_m = pose.offsets_m + step * shared[1:].reshape(25, 3)
-        ends.append(replace(end, rig=reshape(rig.beta + step * shared[:1]), offsets_m=offsets_m))
+        ends.append(replace(end, rig=rig.reshaped(rig.beta + step * shared[:1]), offsets_m=offsets_m))
     for data_term in (problem.space_term, problem.image_term):
         _, equations = problem.assemble(pose, data_term)
         slope = float((equations.frame_gradient * frame.numpy()).sum() + equations.shared_gradient @ shared.numpy())
