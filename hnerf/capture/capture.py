@@ -77,8 +77,12 @@ class Capture:
         return tuple(sorted(set(self.train_frames) | set(self.novel_pose_frames)))
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """Read the image recorded nearest in time to a frame, (H, W, 3) uint8 RGB."""
-        return read_rgb(_image_path(self.root / "images" / camera, f"{self.recorded_frame(camera, frame):06d}"))
+        """Read the image recorded nearest in time to a frame, (H, W, 3) uint8 RGB. Raises InputError without one."""
+        folder, stem = self.root / "images" / camera, f"{self.recorded_frame(camera, frame):06d}"
+        found = sorted(folder.glob(f"{stem}.*"))
+        if not found:
+            raise InputError(f"{folder}/{stem}.*: image missing; every camera needs every frame")
+        return read_rgb(found[0])
 
     def background(self, camera: str) -> np.ndarray | None:
         """Read the clean plate, (H, W, 3) uint8 RGB; None where the recording has none."""
@@ -269,11 +273,3 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     as_stored = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], -1) if colour else np.ascontiguousarray(pixels)
     if not cv2.imwrite(str(path), as_stored, JPEG_OPTIONS if path.suffix == ".jpg" else []):
         raise OSError(f"{path}: cannot be written; is the disk full?")
-
-
-def _image_path(folder: Path, stem: str) -> Path:
-    """Return the only file of this stem in a folder. Raises InputError if there is none."""
-    found = sorted(folder.glob(f"{stem}.*"))
-    if not found:
-        raise InputError(f"{folder}/{stem}.*: image missing; every camera needs every frame")
-    return found[0]

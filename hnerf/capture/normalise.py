@@ -43,11 +43,6 @@ class Normaliser:
             maps = cv2.initUndistortRectifyMap(lens.K, lens.distortion, None, lens.K, recorded_size_px, cv2.CV_16SC2)
         return Normaliser(lens, camera, recorded_size_px, maps)
 
-    @property
-    def changes_pixels(self) -> bool:
-        """Return whether there is anything to undistort or to shrink."""
-        return self.maps is not None or self.camera.size_px != self.recorded_size_px
-
     def pixels(self, recorded: np.ndarray) -> np.ndarray:
         """Return recorded pixels (H, W) or (H, W, 3) uint8 undistorted and shrunk."""
         if self.maps is not None:
@@ -73,7 +68,8 @@ class Normaliser:
         resampling, at a fifth of a PNG's size.
         """
         self._check_size(rgb, source)
-        if verbatim and not self.changes_pixels and _reads_as(verbatim, rgb):
+        unchanged = self.maps is None and self.camera.size_px == self.recorded_size_px
+        if verbatim and unchanged and _reads_as(verbatim, rgb):
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(verbatim, target.with_name(target.name + verbatim.suffix.lower()))
         else:

@@ -62,7 +62,9 @@ def follow_people(cameras: list[Camera], people: list[np.ndarray]) -> list[Perso
         choice, supported, claim = _most_probable_sequence(candidates, left)
         if claim <= 0:
             break
-        choice = np.where(supported | (_usually(supported, choice >= 0) < USUALLY), choice, -1)
+        seen = choice >= 0
+        usually = (supported & seen).sum(0) / seen.sum(0).clip(1)
+        choice = np.where(supported | (usually < USUALLY), choice, -1)
         at = np.arange(frames)
         picked = np.stack([found[at, k] * (k >= 0)[:, None, None] for found, k in zip(left, choice.T, strict=True)])
         tracks.append(PersonTrack(picked, claim, moves(picked)))
@@ -75,12 +77,6 @@ def _most_prominent(camera: Camera, people: np.ndarray) -> np.ndarray:
     """Return a copy of people (frames, P, 25, 3) with the MAX_PAIRED most prominent of each frame, in their order."""
     best = np.argsort(-_prominence(camera, people), axis=1, kind="stable")[:, :MAX_PAIRED]
     return np.take_along_axis(people, np.sort(best, axis=1)[..., None, None], 1)
-
-
-def _usually(supported: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the share of the frames in which a camera sees the person that other cameras support it, (C,); both
-    (frames, C) bool."""
-    return (supported & seen).sum(0) / seen.sum(0).clip(1)
 
 
 def moves(keypoints: np.ndarray) -> bool:
