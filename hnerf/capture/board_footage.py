@@ -154,13 +154,8 @@ def load_board_corners(root: Path) -> BoardCorners | None:
     if not (root / BOARDS_FILE).exists():
         return None
     with np.load(root / BOARDS_FILE, allow_pickle=False) as stored:
-        return BoardCorners(
-            tuple(stored["cameras"].tolist()),
-            stored["corners_m"],
-            stored["corners_px"],
-            int(stored["frame_step"]),
-            tuple(stored["frames"].tolist()),
-        )
+        cameras, frames = (tuple(stored[name].tolist()) for name in ("cameras", "frames"))
+        return BoardCorners(cameras, stored["corners_m"], stored["corners_px"], int(stored["frame_step"]), frames)
 
 
 def read_board(folder: Path) -> Board | None:

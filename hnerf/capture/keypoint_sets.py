@@ -68,11 +68,8 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
     number of points.
     """
     of_25 = [points.reshape(-1, 25, 3) for points in detections.values() if points.shape[-2] == 25]
-    if of_25 and not named and not is_body_25(np.concatenate(of_25)):
-        named_25: KeypointSetName = "body_25b"
-    else:
-        named_25 = "body_25"
-    by_count = {known.points: known for known in SETS.values()} | {25: SETS[named_25]}
+    of_face = not of_25 or is_body_25(np.concatenate(of_25))
+    by_count = {known.points: known for known in SETS.values()} | {25: SETS["body_25" if of_face else "body_25b"]}
     found = {}
     for camera, points in detections.items():
         count = points.shape[-2]

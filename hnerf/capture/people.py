@@ -145,12 +145,8 @@ def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndar
     shown = [found[found[..., 2].any(1)] for found in people]
     hypotheses_m = [np.zeros((0, 25, 3))]
     for a, b in combinations(range(len(cameras)), 2):
-        views = np.stack(
-            [
-                shown[a].repeat(len(shown[b]), axis=0).reshape(-1, 3),
-                np.tile(shown[b], (len(shown[a]), 1, 1)).reshape(-1, 3),
-            ]
-        )
+        in_a, in_b = shown[a].repeat(len(shown[b]), axis=0), np.tile(shown[b], (len(shown[a]), 1, 1))
+        views = np.stack([in_a.reshape(-1, 3), in_b.reshape(-1, 3)])
         hypotheses_m.append(solve_points(projections[[a, b]], views, confidence_of(views)).reshape(-1, 25, 3))
     points_m = np.concatenate(hypotheses_m)
     return [_support(camera, points_m, found) for camera, found in zip(cameras, people, strict=True)]

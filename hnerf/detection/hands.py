@@ -47,13 +47,11 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
         return find_hands(capture.image(name, capture.frames[number]), people[name][number], of_thread.network)
 
     found = list(tracked(side_by_side(find, images), "hands", len(images)))
-    by_camera = np.stack(found).reshape(len(capture.train_cameras), len(capture.frames), 2, POINTS, 3)
+    stacked = np.stack(found).reshape(len(capture.train_cameras), len(capture.frames), 2, POINTS, 3)
+    by_camera = dict(zip(capture.train_cameras, stacked, strict=True))
     shutil.copytree(capture.root, out, dirs_exist_ok=True)
-    write_points(out / HANDS, dict(zip(capture.train_cameras, by_camera, strict=True)))
-    return {
-        name: float((hands[..., 0, 2] > FOUND).mean())
-        for name, hands in zip(capture.train_cameras, by_camera, strict=True)
-    }
+    write_points(out / HANDS, by_camera)
+    return {name: float((hands[..., 0, 2] > FOUND).mean()) for name, hands in by_camera.items()}
 
 
 class HandNetwork:

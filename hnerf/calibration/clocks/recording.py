@@ -43,11 +43,8 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
         sound = read_sound(footage.path) if isinstance(footage, Video) else None
         if sound is not None:
             sounds[name] = sound
-    near_s = {}
-    for a, b in combinations(names, 2):
-        found_s = sound_offset(sounds[a], sounds[b]) if a in sounds and b in sounds else None
-        if found_s is not None:
-            near_s[a, b] = found_s
+    apart_s = {(a, b): sound_offset(sounds[a], sounds[b]) for a, b in combinations(sounds, 2)}
+    near_s = {pair: offset_s for pair, offset_s in apart_s.items() if offset_s is not None}
     heard = {name for pair in near_s for name in pair}
     sources = {name: "keypoints and sound" if name in heard else "keypoints" for name in names}
     cameras = {name: Camera(name, lens.K, lens.R, lens.t_m, 1, 1) for name, lens in lenses.items()}
