@@ -179,9 +179,7 @@ def test_one_turned_camera_is_named_and_refined(tmp_path: Path) -> None:
     capture = recorded_with(tmp_path / "in", lambda c: turned(c, 1.0), only=2)
     assert true_error_px(capture.cameras["c2"], ring(4)[2]) == pytest.approx(17.5, abs=1)
     report = check_calibration(capture, SETTINGS)
-    assert {name: v.status for name, v in report.verdicts.items()} == {
-        "c0": "ok", "c1": "ok", "c2": "refined", "c3": "ok"
-    }  # fmt: skip
+    assert [verdict.status for verdict in report.verdicts.values()] == ["ok", "ok", "refined", "ok"]
     assert any("an outlier" in reason for reason in report.verdicts["c2"].reasons)
     assert true_error_px(report.cameras["c2"], ring(4)[2]) < 1
     report.save(tmp_path / "out")

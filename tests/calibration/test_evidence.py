@@ -16,7 +16,7 @@ from hnerf.calibration.report import load_cameras
 from hnerf.calibration.sheet import _scatter, draw_evidence
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.capture.capture import Capture
-from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.subject import ranked_people
 from hnerf.config import CalibrationSettings
 from tests.calibration.synthetic import turned
 
@@ -45,8 +45,7 @@ def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path, monkeyp
 def test_matches_of_a_pair_speak_for_both_cameras(wave: Capture, tmp_path: Path) -> None:
     # One point of the world, 3 px too low in the first camera: up to 3 px, shared between both images.
     cameras = [wave.cameras[name] for name in wave.train_cameras]
-    found = subject_keypoints(wave)
-    keypoints = np.stack([found[name] for name in wave.train_cameras])
+    keypoints = ranked_people(wave)[0].keypoints
     point_m = np.array([[0.1, 0.2, 1.0]])
     matched = np.stack([camera.project(point_m)[0] for camera in cameras[:2]], 1)
     matched[0, 0, 1] += 3
@@ -65,7 +64,7 @@ def test_the_sheet_asks_for_outlines_as_often_for_many_cameras_and_draws_none_th
 ) -> None:
     """In the middle of the instants, which is shown, only one camera has an outline: nothing says how far it is off."""
     cameras = [wave.cameras[name] for name in wave.train_cameras]
-    keypoints = np.stack([subject_keypoints(wave)[name] for name in wave.train_cameras])
+    keypoints = ranked_people(wave)[0].keypoints
     disc = np.zeros(cameras[0].size_px[::-1], np.uint8)
     outline = MaskOutline.around(cv2.circle(disc, (disc.shape[1] // 2, disc.shape[0] // 2), 40, 1, cv2.FILLED) > 0)
     outlines = Outlines({"01": [outline, outline], "02": [outline, None]}, (0, 1))
@@ -81,7 +80,7 @@ def test_the_sheet_asks_for_outlines_as_often_for_many_cameras_and_draws_none_th
 
 def test_without_masks_the_report_says_so(wave: Capture) -> None:
     cameras = [wave.cameras[name] for name in wave.train_cameras]
-    keypoints = np.stack([subject_keypoints(wave)[name] for name in wave.train_cameras])
+    keypoints = ranked_people(wave)[0].keypoints
     said = Evidence(wave, keypoints, None, Matches({}, 0), None).summarise(cameras, measure(cameras, keypoints))
     assert said["silhouettes"].startswith("none: ") and said["match_pairs"] == "no overlap: no matches"
 

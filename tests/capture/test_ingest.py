@@ -74,11 +74,7 @@ def test_capture_toml_names_and_splits(folder: Path, tmp_path: Path) -> None:
     assert (capture.name, capture.fps, capture.up) == ("Ann B.", 12.5, "y")
     assert (capture.train_cameras, capture.test_cameras) == (("02",), ("01",))
     assert (capture.train_frames, capture.novel_pose_frames, capture.frames) == ((1, 3), (4,), (1, 3, 4))
-    assert sorted(p.name for p in (tmp_path / "out" / "images" / "01").iterdir()) == [
-        "000001.png",
-        "000003.png",
-        "000004.png",
-    ]
+    assert {p.name[:6] for p in (tmp_path / "out" / "images" / "01").iterdir()} == {"000001", "000003", "000004"}
 
 
 def test_what_is_of_no_calibrated_camera_is_told(
