@@ -82,25 +82,10 @@ def test_one_hand_found_twice_is_the_nearer_arms() -> None:
     assert not found[0].any() and found[1, 0, 2] == 0.9
 
 
-def test_hands_lie_with_the_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
-    capture = Capture.load(tmp_path / "capture")
-    nobody = dict.fromkeys(capture.train_cameras, np.zeros((len(capture.frames), 25, 3)))
-    monkeypatch.setattr(hands, "subject_keypoints", lambda recording: nobody)
-    monkeypatch.setattr(hands, "HandNetwork", lambda: None)
-    monkeypatch.setattr(hands, "find_hands", lambda image, keypoints, network: np.full((2, 21, 3), 0.6))
-    assert detect_hands(capture, tmp_path / "out") == dict.fromkeys(capture.train_cameras, 1.0)
-    written = Capture.load(tmp_path / "out")
-    name = capture.train_cameras[0]
-    points, own = written.hands(name), written.keypoints(name)
-    assert points is not None and points.shape == (len(capture.frames), 2, 21, 3) and own is not None
-    np.testing.assert_array_equal(own, capture.keypoints(name))
-    assert capture.hands(name) is None
-
-
-def test_each_thread_has_a_network_of_its_own_and_hands_stay_in_order(
+def test_each_thread_has_a_network_of_its_own_and_hands_lie_in_order_with_the_capture(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Points and confidences are the numbers of the images, from 0 to 9; a hand counts as found above .5."""
     ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
     capture = Capture.load(tmp_path / "capture")
     numbers = np.arange(len(capture.train_cameras) * len(capture.frames)).reshape(len(capture.train_cameras), -1)
@@ -117,9 +102,10 @@ def test_each_thread_has_a_network_of_its_own_and_hands_stay_in_order(
     monkeypatch.setattr(hands, "subject_keypoints", lambda recording: people)
     monkeypatch.setattr(hands, "HandNetwork", object)
     monkeypatch.setattr(hands, "find_hands", find)
-    detect_hands(capture, tmp_path / "out")
+    assert detect_hands(capture, tmp_path / "out") == {"01": 0.8, "02": 1.0}
     assert max(map(len, used.values())) == 1
     written = Capture.load(tmp_path / "out")
     for name, row in zip(capture.train_cameras, numbers, strict=True):
-        points = written.hands(name)
-        assert points is not None and points[:, 0, 0, 0].tolist() == row.tolist()
+        points, own = written.hands(name), written.keypoints(name)
+        assert points is not None and points.shape == (5, 2, 21, 3) and points[:, 0, 0, 0].tolist() == row.tolist()
+        assert own is not None and np.array_equal(own, capture.keypoints(name)) and capture.hands(name) is None
