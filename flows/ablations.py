@@ -63,12 +63,12 @@ def ablate(
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(artifact_store, source, rows[FULL].capture).root).name
     table = artifact_store.root / "ablations" / f"{subject}-{Path(preset).stem}{'-part' if only else ''}.md"
+    artifact_store.claim_table(table, source.digest, source.root)
     result: dict[str, Any] = {"subject": subject, "preset": preset, "overrides": overrides, "left_out": left_out}
     result["rows"] = {}
     for name, settings in rows.items():
         log.info("%s", name)
         result["rows"][name] = measure(artifact_store, source, truth, settings)
-        table.parent.mkdir(parents=True, exist_ok=True)
         replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
         replace_text(table, as_markdown(result))
     publish_markdown(table.read_text(), "ablations", f"What each part of {preset} is worth on {subject}")

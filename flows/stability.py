@@ -79,7 +79,7 @@ def stability(
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest_part(artifact_store, source, plan, next(iter(presets.values()))).root).name
     table = artifact_store.root / "stability" / f"{subject}-{Path(study).stem}{'' if plan == whole else '-part'}.md"
-    table.parent.mkdir(parents=True, exist_ok=True)
+    artifact_store.claim_table(table, source.digest, source.root)
     result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
     result |= {"left_out": plan.left_out(), "protocol": None, "runs": []}
     try:

@@ -8,6 +8,7 @@
     <store>/<stage>/<key>.lock      locked (flock) while a process works on the key; the kernel releases it if that dies
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
     <store>/subjects/<name>/.recording  the digest and the folder of the recording that these are of
+    <store>/<study>/<table>.recording  the same of a study's table, where <study> is ablations, benchmark or stability
     <store>/.running/                which artifacts each running process uses (tasks/pins.py)
 
 The record's time of change is that of its last use (tasks/garbage.py).
@@ -204,14 +205,26 @@ class Store:
         another folder: two recordings of one name replace each other's results."""
         path, claimed = self.subject_folder(subject) / RECORDING, f"{digest}\n{folder}\n"
         path.parent.mkdir(parents=True, exist_ok=True)
-        before = path.read_text(errors="replace") if path.is_file() and not path.is_symlink() else claimed
-        if before != claimed and before.splitlines()[1:] != [str(folder)] and not before.startswith(digest):
+        before = _text(path)
+        if other := _other_recording(before, digest, folder):
             log.warning(
                 "%s showed the results of %s and will show those of %s; give one of them another name in capture.toml",
-                path.parent, " ".join(before.splitlines()[1:]), folder,
+                path.parent, other, folder,
             )  # fmt: skip
-        if before != claimed or not path.exists():
+        if before != claimed:
             replace_text(path, claimed)
+
+    def claim_table(self, table: Path, digest: str, folder: Path) -> None:
+        """Note beside a study's table which recording it is of, and make its folder. Raises InputError if there is one
+        of another recording, in another folder, which would be lost."""
+        note = table.with_suffix(RECORDING)
+        if table.exists() and (other := _other_recording(_text(note), digest, folder)):
+            raise InputError(
+                f"{table}: is of {other}, not of {folder}; give one of them another name in capture.toml, or give "
+                "--store another folder"
+            )
+        table.parent.mkdir(parents=True, exist_ok=True)
+        replace_text(note, f"{digest}\n{folder}\n")
 
     def subject_folder(self, subject: str) -> Path:
         """Return the folder with links to a subject's latest artifacts."""
@@ -219,8 +232,7 @@ class Store:
 
     def recording(self, subject: str) -> str:
         """Return the digest and the folder of a subject's recording, a line each; empty where they are not known."""
-        path = self.subject_folder(subject) / RECORDING
-        return path.read_text(errors="replace") if path.is_file() and not path.is_symlink() else ""
+        return _text(self.subject_folder(subject) / RECORDING)
 
     def path(self, stage: str, key: str, suffix: str = "") -> Path:
         """Return where an artifact lies, or what belongs to it (.json, .partial, .lock)."""
@@ -336,6 +348,17 @@ def remove(folder: Path) -> None:
         folder.unlink()
     else:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _text(note: Path) -> str:
+    """Return what a note of the store says; empty where there is none, or a link in its place."""
+    return note.read_text(errors="replace") if note.is_file() and not note.is_symlink() else ""
+
+
+def _other_recording(note: str, digest: str, folder: Path | str) -> str:
+    """Return the folder that a note names, if it is of a recording of other content in another folder; else nothing."""
+    noted, _, other = note.strip().partition("\n")
+    return "" if noted == digest or other == str(folder) else " ".join(other.splitlines())
 
 
 def _is_at(path: Path, descriptor: int) -> bool:

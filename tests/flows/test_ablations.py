@@ -60,7 +60,9 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
         monkeypatch.setattr(train_subject, name, lambda *_: None)
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
     monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
-    monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
+    monkeypatch.setattr(
+        module, "read_capture", lambda folder, _: (SimpleNamespace(root=folder, digest=str(folder)), None)
+    )
     monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada"))
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "evaluate", evaluate)
@@ -179,6 +181,14 @@ def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettin
     assert [rows[name]["novel_view"]["psnr"] for name in ("full", "no-segmentation")] == [0.02, 0.0]
     assert rows["full"]["seconds"] == 61.7
     assert table.read_text() == as_markdown(result)
+
+
+def test_the_table_of_another_capture_of_the_name_stays(stages: list[TrainingSettings], tmp_path: Path) -> None:
+    table = ablate.fn(tmp_path / "ada", "fast", tmp_path / "store", [], ["no-segmentation"])
+    before, trained = table.read_text(), len(stages)
+    with pytest.raises(InputError, match=f"ada-fast-part.md: is of {tmp_path}/ada, not of {tmp_path}/other"):
+        ablate.fn(tmp_path / "other", "fast", tmp_path / "store", [], ["no-opt"])
+    assert table.read_text() == before and len(stages) == trained
 
 
 def test_new_poses_are_not_scored_of_what_has_none(stages: list[TrainingSettings], tmp_path: Path) -> None:

@@ -80,7 +80,10 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
     monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
     monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
-    monkeypatch.setattr(module, "read_capture", lambda *_: (None, SimpleNamespace(root=tmp_path)))
+    truth = SimpleNamespace(root=tmp_path)
+    monkeypatch.setattr(
+        module, "read_capture", lambda folder, _: (SimpleNamespace(root=folder, digest=str(folder)), truth)
+    )
     true_mask(tmp_path).parent.mkdir(parents=True)
     true_mask(tmp_path).touch()
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: RECORDED)
@@ -272,6 +275,15 @@ def test_a_part_of_a_study_does_not_replace_its_table(
     table = benchmark.fn(tmp_path, study, methods, seconds, tmp_path / "store")
     assert table.name == name
     assert json.loads(table.with_suffix(".json").read_text())["study"] == "toys"  # in the caption
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_table_of_another_capture_of_the_name_stays(stages: Stages, study: str, tmp_path: Path) -> None:
+    benchmark.fn(tmp_path / "ada", study, ["demo"], store=tmp_path / "store")
+    trained = len(stages)
+    with pytest.raises(InputError, match=f"ada-toys-part.md: is of {tmp_path}/ada, not of {tmp_path}/other"):
+        benchmark.fn(tmp_path / "other", study, ["fast"], store=tmp_path / "store")
+    assert len(stages) == trained
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -88,7 +88,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         return degrade(degradation)
 
     def read_capture(folder: Path, store: Path | None = None) -> tuple[Any, Any]:
-        return None, "true" if store else f"of {folder.name}"
+        return SimpleNamespace(root=folder, digest=str(folder)), "true" if store else f"of {folder.name}"
 
     def show(_: Any, __: Any, degradation: Any) -> Any:
         fault = "surface is not watertight" if degradation.strength == 60 else None
@@ -306,6 +306,13 @@ def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
     folder = tmp_path / "store" / "stability"
     assert json.loads((folder / "ada-mine-part.json").read_text()) == earlier
     assert "degraded at 2" in (folder / "ada-mine-part.md").read_text()
+
+
+def test_the_table_of_another_capture_of_the_name_stays(tmp_path: Path) -> None:
+    earlier = study(tmp_path, only=["pose_noise"])
+    with pytest.raises(InputError, match=f"ada-mine-part.md: is of {tmp_path}, not of {tmp_path}/other; give one"):
+        stability.fn(tmp_path / "other", str(tmp_path / "mine.yaml"), tmp_path / "store", only=["skirt"])
+    assert json.loads((tmp_path / "store" / "stability" / "ada-mine-part.json").read_text()) == earlier
 
 
 def test_a_chart_that_cannot_be_drawn_hides_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -248,6 +248,22 @@ def test_two_recordings_of_one_name_are_said(tmp_path: Path, caplog: pytest.LogC
     assert f"subjects/ada showed the results of {tmp_path}/moved/ada and will show those of {theirs}" in caplog.text
 
 
+def test_a_table_of_another_recording_is_kept(tmp_path: Path) -> None:
+    store, table = Store(tmp_path), tmp_path / "ablations" / "ada.b-fast.md"
+    mine, theirs = tmp_path / "mine" / "ada", tmp_path / "theirs" / "ada"
+    store.claim_table(table, "c" * 64, theirs)  # and is interrupted before its first row
+    store.claim_table(table, "d" * 64, mine)
+    table.touch()
+    store.claim_table(table, "e" * 64, mine)  # the same folder, changed
+    store.claim_table(table, "e" * 64, tmp_path / "moved" / "ada")  # the same content, moved
+    with pytest.raises(
+        InputError, match=f"ada.b-fast.md: is of {tmp_path}/moved/ada, not of {theirs}; give one of them"
+    ):
+        store.claim_table(table, "f" * 64, theirs)
+    table.with_suffix(".recording").unlink()  # as beside a table of an earlier version
+    store.claim_table(table, "f" * 64, theirs)
+
+
 def test_a_damaged_note_of_the_recording_is_written_again(tmp_path: Path) -> None:
     store = Store(tmp_path)
     note = store.subject_folder("ada") / RECORDING

@@ -21,10 +21,14 @@ TRAINING_DISTANCE_PANELS = (  # distance, split, score, labels of distance and s
 SWEEP_FIGURES = {"psnr": PSNR, "geometry.chamfer_l2_e3": f"{CHAMFER}, 1e-3 m²"}
 
 
+def table_of(result: Mapping[str, Any], store: Path) -> Path:
+    """Return `<store>/benchmark/<subject>-<study>.md`, its study ending in "-part" if it is one."""
+    return store / "benchmark" / f"{result['subject']}-{result['study']}{'-part' if result['part'] else ''}.md"
+
+
 def publish(result: dict[str, Any], store: Path) -> Path:
-    """Write `<store>/benchmark/<subject>-<study>.{md,csv,json}`, its study ending in "-part" if it is one, and its PNGs
-    anew; return the Markdown file's path."""
-    table = store / "benchmark" / f"{result['subject']}-{result['study']}{'-part' if result['part'] else ''}.md"
+    """Write a result's table, with CSV and JSON beside it, and its PNGs anew; return the table's path."""
+    table = table_of(result, store)
     table.parent.mkdir(parents=True, exist_ok=True)
     drawn = draw_charts(result, store, table)
     replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
