@@ -19,7 +19,7 @@ from hnerf.errors import DISK_FULL, REASON, InputError, InvalidAsset
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
 from tasks.source import place
-from tasks.store import NAME
+from tasks.store import NAME, Store
 
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143  # the last two as shells have them
 NO_ROOM = (None, *DISK_FULL, errno.EFBIG)  # None: our own, of libraries that do not say why
@@ -122,6 +122,8 @@ def _existing(options: argparse.Namespace) -> list[Path]:
             raise InputError(f"{motion}: no such file; give {MOTIONS}")
     if isinstance(out := getattr(options, "out", None), Path):
         _require_outside_artifacts(out)
+        if _recording(options) in out.resolve().parents:
+            raise InputError(f"{out}: lies in the recording, whose results would be computed again; give another")
     for option in ("path", "lens"):
         file = getattr(options, option, None)
         if file and not file.exists():
@@ -134,6 +136,21 @@ def _require_outside_artifacts(out: Path) -> None:
     for folder in out.resolve().parents:
         if NAME.fullmatch(f"{folder.parent.name}/{folder.name}") and folder.with_name(f"{folder.name}.json").is_file():
             raise InputError(f"{out}: lies in the results of a run, which would count as damaged; give another")
+
+
+def _recording(options: argparse.Namespace) -> Path | None:
+    """Return the recording that a command reads, or has results of; None where that is not known."""
+    if options.command is commands.export_cameras:
+        return options.folder.resolve()
+    if "name" in options:
+        subject = options.store / "subjects" / options.name
+    elif "subject" in options:
+        subject = options.subject
+    else:
+        return None
+    folder = subject.resolve()
+    noted = Store(folder.parent.parent).recording(folder.name).partition("\n")[2].strip()
+    return Path(noted) if noted else None
 
 
 def _name(command: Command) -> str:

@@ -170,8 +170,6 @@ def _synchronise(options: argparse.Namespace, path: Path) -> None:
 
 def export_cameras(options: argparse.Namespace) -> None:
     """Write the cameras of a capture in the format of another tool."""
-    if options.folder.resolve() in options.out.resolve().parents:
-        raise InputError(f"{options.out}: lies in the recording, whose results would be computed again; give another")
     with atomic_folder(options.out) as partial:
         _read_in_cage(_export_cameras, options, partial)
     print(f"cameras: {options.out}")

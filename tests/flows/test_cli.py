@@ -170,6 +170,22 @@ def test_cameras_are_not_exported_into_the_recording(
     assert main(["export-cameras", str(folder), "--format", "colmap", "--out", "../ada-cameras"]) == 0
 
 
+@pytest.mark.parametrize("command", ["render .", "export ../ada", "store export ada --store ../.."])
+def test_nothing_new_is_written_into_the_recording(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The subject's folder notes which that is."""
+    store, recording = Store(tmp_path / "store"), tmp_path / "recordings" / "ada"
+    recording.mkdir(parents=True)
+    store.claim("ada", "d" * 64, recording)
+    monkeypatch.chdir(store.subject_folder("ada"))
+    assert main([*command.split(), "--out", f"{recording}/new"]) == 2
+    assert f"hnerf: {recording}/new: lies in the recording" in capsys.readouterr().err
+    assert main([*command.split(), "--out", "new"]) == 2  # as there are no results
+    assert "lies in the recording" not in capsys.readouterr().err
+    assert list(recording.iterdir()) == []
+
+
 @pytest.mark.parametrize("command", ["render ada", "export ada", "store export ada"])
 def test_nothing_new_is_written_into_an_artifact(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
