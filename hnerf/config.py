@@ -446,6 +446,10 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
         wrong, advice = first["msg"].removeprefix("Value error, "), "correct it"
         if first["type"] == "missing":
             wrong, advice = "is missing", "add it"
+        if first["type"] == "tuple_type":
+            wrong, advice = "is not a list", "write it like [8,16]"
+        if first["type"] in ("model_type", "model_attributes_type"):
+            wrong, advice = "is a section", "give its keys, each with a value"
         if first["type"] == "union_tag_not_found":
             wrong, advice = f"{first['ctx']['discriminator']} is missing", "add it"
         if first["type"] == "extra_forbidden":

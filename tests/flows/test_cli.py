@@ -67,6 +67,12 @@ from tests.shared_data import shared_capture
         (["run", "absent", "--set", "training.stepz=1"], "training.stepz: no such key; did you mean steps?"),
         (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),
         (["run", "absent", "--set", "training.field.colour_cells=[8,-3]"], "training.field.colour_cells.1"),
+        (
+            ["run", "absent", "--set", "training.field.colour_cells=8,16"],
+            "training.field.colour_cells: is not a list; write it like [8,16]",
+        ),
+        (["run", "absent", "--set", "training=8"], "training: is a section; give its keys, each with a value"),
+        (["run", "absent", "--set", "training.field=8"], "training.field: is a section; give its keys, each with"),
         (["synth", "."], "exists; give the name of a new folder"),
         (["synth", "ring", "--set", "cameras=32"], "cameras: no such key; did you mean test_cameras?"),
     ],
