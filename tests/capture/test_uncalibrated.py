@@ -110,6 +110,14 @@ def test_a_lens_file_of_other_cameras_is_refused(tmp_path: Path) -> None:
         Uncalibrated(tmp_path, file).lenses()
 
 
+def test_a_lens_file_without_intrinsics_is_refused(tmp_path: Path) -> None:
+    write_images(tmp_path, "a")
+    here = (np.eye(3), np.zeros(4), np.eye(3), np.zeros(3), (200, 100))
+    easymocap.write_easymocap(tmp_path, [Lens("a", *here)])
+    with pytest.raises(InputError, match=r"extri.yml: has no intrinsics \(K_<camera>\); give an intri.yml$"):
+        Uncalibrated(tmp_path, tmp_path / "extri.yml").lenses()
+
+
 def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> None:
     folder = tmp_path / "film"
     write_video(folder / "videos" / "left.mp4", 3, (64, 96))
