@@ -28,7 +28,7 @@ def with_shape_values(rig: Rig, changes: Mapping[str, float]) -> Rig:
     beta = rig.beta.clone()
     for name, change in changes.items():
         if name not in rig.beta_names:
-            raise InputError(f"shape {name}: this body's values are {', '.join(rig.beta_names)}")
+            raise InputError(f"--shape {name}: no such value; this body's are {', '.join(rig.beta_names)}")
         beta[rig.beta_names.index(name)] += change
     title = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
     return _require_unfolded(rig.reshaped(beta), rig, f"shape {title}")

@@ -77,9 +77,11 @@ def _checked_capture(subject: Path, options: RenderOptions) -> Capture:
     require_files(subject, ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors"))
     unknown = [kind for kind in options.what if kind not in OUTPUT_KINDS]
     if unknown or not options.what:
-        raise InputError(f"what {','.join(unknown)}: choose from {', '.join(OUTPUT_KINDS)}")
+        raise InputError(f"--what {','.join(unknown)}: choose from {', '.join(OUTPUT_KINDS)}")
     if (options.camera or options.path) and (options.radius_m is not None or options.height_m is not None):
         raise InputError("--radius and --height are for an orbit; omit them, or omit --camera and --path")
+    if options.between and options.frames != ":":
+        raise InputError(f"--frames {options.frames}: has no effect with --between; leave it out")
     if options.pictures is not None and options.pictures < 1:
         raise InputError(f"{options.pictures} pictures: give 1 or more")
     return recording_of(subject)
@@ -112,7 +114,7 @@ def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Ca
     poses = len(body.frames) if len(body.frames) > 1 else None
     if options.camera is not None:
         if options.camera not in capture.cameras:
-            raise InputError(f"camera {options.camera}: the recording has {', '.join(capture.cameras)}")
+            raise InputError(f"--camera {options.camera}: no such camera; there are {', '.join(capture.cameras)}")
         found = [capture.cameras[options.camera]] * (options.pictures or poses or 1)
     elif options.path is not None:
         keys = read_camera_path(options.path, capture.recorded_sizes_px[recorded[0].name])

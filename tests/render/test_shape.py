@@ -88,7 +88,7 @@ def test_a_shape_that_turns_its_skin_inside_out_is_refused() -> None:
 
 
 def test_an_unknown_value_is_refused_with_those_that_there_are() -> None:
-    with pytest.raises(InputError, match="fat: this body's values are weight, length"):
+    with pytest.raises(InputError, match="--shape fat: no such value; this body's are weight, length"):
         with_shape_values(changeable_rig(), {"fat": 1.0})
 
 

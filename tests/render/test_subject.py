@@ -164,10 +164,11 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--camera", "9"], "camera 9: the recording has 0, 1, 2, 3"),
-        (["--what", "colour,xray"], "what xray: choose from colour, depth, normals, mask, mesh"),
+        (["--camera", "9"], "--camera 9: no such camera; there are 0, 1, 2, 3"),
+        (["--what", "colour,xray"], "--what xray: choose from colour, depth, normals, mask, mesh"),
         (["--camera", "0", "--height", "1"], "--radius and --height are for an orbit"),
         (["--frames", "7"], "no frames 7; it has 0 to 2"),
+        (["--frames", "0", "--between", "0", "2"], "--frames 0: has no effect with --between; leave it out"),
         (["--between", "0", "7"], "no frames 7; it has 0 to 2"),
         (["--motion", "absent.npz"], "absent.npz: no such file"),
         (["--path", "absent.json"], "absent.json: no such file; give --path another"),
