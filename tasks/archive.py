@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from hnerf.config import validated
 from hnerf.errors import InputError
-from hnerf.files import atomic_file
+from hnerf.files import atomic_file, made_folder
 from tasks.inventory import Inventory
 from tasks.packed import Contents, Name, archived, pack, place, read_contents, require_room, unpack
 from tasks.store import OPTIONAL, STAGES, Artifact, Store
@@ -44,7 +44,7 @@ def export_subject(store: Store, subject: str, out: Path) -> Manifest:
     artifacts = [_intact(store, *name.split("/")) for name in sorted(inventory.with_inputs(latest.values()))]
     described = {"subject": subject, "recording": store.recording(subject), "latest": latest}
     manifest = validated(Manifest, {**described, "artifacts": archived(artifacts)}, store.subject_folder(subject))
-    with atomic_file(out) as beside:
+    with made_folder(out.parent), atomic_file(out) as beside:
         pack(manifest, store, beside)
     return manifest
 

@@ -57,6 +57,8 @@ def test_out_and_in(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["store", "verify", "--store", "other"]) == 0
     assert main(["store", "import", "none.tar"]) == 2
     assert main(["store", "list", "--store", "none"]) == 2
+    assert main(["store", "export", "ada", "--out", "new/ada.tar"]) == 0 and Path("new/ada.tar").exists()
+    assert main(["store", "export", "nobody", "--out", "newer/ada.tar"]) == 2 and not Path("newer").exists()
 
 
 @pytest.mark.parametrize("command", ["list", "verify", "gc --yes --older 0", "show ada", "export ada"])
