@@ -4,6 +4,8 @@ import os
 import signal
 import subprocess
 import sys
+import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -35,6 +37,19 @@ def test_sigterm_is_one_line_and_leaves_nothing_half_written(tmp_path: Path) -> 
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (143, "hnerf: ended by SIGTERM\n")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+def test_a_signal_that_python_drops_comes_again(number: signal.Signals, raised: type[BaseException]) -> None:
+    class Referred:
+        """What a weak reference can point to."""
+
+    referred = Referred()
+    reference = weakref.ref(referred, lambda _: signal.raise_signal(number))
+    with pytest.raises(raised) as found, unwound_by_sigterm():
+        del referred
+        time.sleep(10)
+    assert reference() is None and found.type is raised
 
 
 def test_a_second_sigterm_does_not_end_what_cleans_up(tmp_path: Path) -> None:
