@@ -2,6 +2,7 @@ import dataclasses
 import math
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from hnerf.body.anny import anny_rig
@@ -100,3 +101,9 @@ def test_a_saved_rig_is_read_back_whole(tmp_path: Path) -> None:
             assert was == now
         else:
             assert was.dtype == now.dtype and torch.equal(was, now), field.name
+
+
+def test_the_file_holds_no_pickles(tmp_path: Path) -> None:
+    two_bone_rig().save(tmp_path / "rig.npz")
+    with np.load(tmp_path / "rig.npz", allow_pickle=False) as stored:
+        assert all(stored[name].dtype != object for name in stored)

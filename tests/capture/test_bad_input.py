@@ -30,6 +30,12 @@ def _nan_keypoint(folder: Path) -> None:
     rec.write_keypoints(folder / "openpose/01/000001_keypoints.json", [points])
 
 
+def _far_shoulder(folder: Path) -> None:
+    points = np.full((25, 3), 0.5)
+    points[2] = 1e308, 1e308, 1
+    rec.write_keypoints(folder / "openpose/01/000001_keypoints.json", [points])
+
+
 def _scale_keypoints(factor: float) -> Callable[[Path], object]:
     def damage(folder: Path) -> None:
         for path in (folder / "openpose/01").iterdir():
@@ -170,6 +176,7 @@ EASYMOCAP = {
         "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to 1.02 are not in the pixels",
     ),
     "keypoints of larger pictures": (_scale_keypoints(4), "not in the pixels of pictures of 24 x 16"),
+    "keypoint whose mean with another overflows": (_far_shoulder, "000001_keypoints.json: a keypoint is beyond 1e+06"),
     "NaN keypoint": (_nan_keypoint, "000001_keypoints.json"),
     "a thousand people": (
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text(json.dumps({"people": [{}] * 1000})),

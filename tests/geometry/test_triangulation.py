@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.subject import subject_keypoints
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import _best_pair, solve_points, triangulate
 from tests.calibration.synthetic import detections, ring, walk_m, write_capture
@@ -123,3 +124,10 @@ def test_test_cameras_are_never_read(tmp_path: Path) -> None:
     capture = write_capture(tmp_path, cameras, {c: k for c, k in detections(cameras, 1).items() if c != "c3"})
     capture = dataclasses.replace(capture, train_cameras=("c0", "c1", "c2"), test_cameras=("c3",))
     assert set(subject_keypoints(capture)) == {"c0", "c1", "c2"}
+
+
+def test_nobody_is_an_error(tmp_path: Path) -> None:
+    cameras = ring(3)
+    seen = {name: k * [1, 1, name == "c0"] for name, k in detections(cameras, 1).items()}
+    with pytest.raises(InputError, match="no person"):
+        subject_keypoints(write_capture(tmp_path, cameras, seen))
