@@ -8,12 +8,7 @@ def test_a_table() -> None:
         *head(["method", "dB"]),
         line(["fast", shown(32.678, "{:.2f}")]),
         line(["nerf", shown(None, "{:.2f}")]),
-    ] == [
-        "| method | dB |",
-        "|---|---|",
-        "| fast | 32.68 |",
-        "| nerf | - |",
-    ]
+    ] == ["| method | dB |", "|---|---|", "| fast | 32.68 |", "| nerf | - |"]
 
 
 def test_a_value_deep_in_a_tree() -> None:

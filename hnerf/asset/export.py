@@ -20,13 +20,7 @@ from hnerf.asset.bvh_file import write_avatar_bvh
 from hnerf.asset.comparison import Compared, compare_with_field, comparison_figures, require_close
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.extreme_poses import extreme_poses
-from hnerf.asset.figures import (
-    beyond_skinning_mm,
-    level_figures,
-    mesh_figures,
-    rig_figures,
-    splat_figures,
-)
+from hnerf.asset.figures import beyond_skinning_mm, level_figures, mesh_figures, rig_figures, splat_figures
 from hnerf.asset.glb import write_glb
 from hnerf.asset.normal_map import normal_map
 from hnerf.asset.package import AssetInfo, Avatars, write_cache, write_package, write_splats, write_usdz

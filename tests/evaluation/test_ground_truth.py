@@ -93,9 +93,7 @@ def test_truth_is_undistorted_as_photographs_are(truth: GroundTruth) -> None:
     distortion = np.array([0.0, 0.0, 0.5, 0.5])
     straight = truth.mask("c", 1)
     bent = replace(
-        truth.capture,
-        recorded_sizes_px={"c": size_px},
-        recorded_lenses={"c": (camera.K.tolist(), distortion.tolist())},
+        truth.capture, recorded_sizes_px={"c": size_px}, recorded_lenses={"c": (camera.K.tolist(), distortion.tolist())}
     )
     found = replace(truth, capture=bent).mask("c", 1)
     lens = Lens("c", camera.K, distortion, np.eye(3), np.zeros(3), size_px)

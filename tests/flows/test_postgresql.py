@@ -12,10 +12,7 @@ from tests.prefect_server import prefect_server
 
 PATIENCE_S = 300.0
 
-pytestmark = [
-    pytest.mark.soak,
-    pytest.mark.skipif(not BINARIES, reason="Debian's postgresql is not installed"),
-]
+pytestmark = [pytest.mark.soak, pytest.mark.skipif(not BINARIES, reason="Debian's postgresql is not installed")]
 
 
 @pytest.fixture

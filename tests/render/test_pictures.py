@@ -12,14 +12,7 @@ from hnerf.avatar.avatar import Avatar, Rendering
 from hnerf.capture.footage import Video
 from hnerf.geometry.camera import Camera
 from hnerf.render import pictures
-from hnerf.render.pictures import (
-    depth_image,
-    depth_span_mm,
-    normal_image,
-    read_depth_grey,
-    write_pictures,
-    write_video,
-)
+from hnerf.render.pictures import depth_image, depth_span_mm, normal_image, read_depth_grey, write_pictures, write_video
 from tests.evaluation.ball import RADIUS_M, RENDERED, SIZE_PX, BallAvatar, ball_camera, ball_fit, centre_m, seen
 
 CAMERA = ball_camera("a", 0.0)  # 0.75 m from the ball, on the x axis

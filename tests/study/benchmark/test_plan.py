@@ -117,10 +117,7 @@ def test_snapshots_halve_the_limit_or_double_from_a_quarter_minute() -> None:
 
 def test_narrowing_keeps_methods_where_they_were_and_tries_presets_everywhere() -> None:
     study = BenchmarkStudy(
-        title="t",
-        seconds=60,
-        methods=("a", "b"),
-        variants={"all": Variant(methods=("b",)), "one": Variant(frames=1)},
+        title="t", seconds=60, methods=("a", "b"), variants={"all": Variant(methods=("b",)), "one": Variant(frames=1)}
     )
     assert study.restricted_to([], None) == study.model_copy(
         update={"variants": {"all": Variant(methods=("b",)), "one": Variant(frames=1, methods=("a", "b"))}}

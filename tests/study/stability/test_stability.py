@@ -103,9 +103,7 @@ RESULT = {
     "subject": "ada",
     "study": "mine",
     "plan": StabilityStudy(
-        methods=("fast", "nerf"),
-        seeds=(0, 1),
-        degradations={"pose_noise": (1, 2, 5), "mask_holes": (5, 10)},
+        methods=("fast", "nerf"), seeds=(0, 1), degradations={"pose_noise": (1, 2, 5), "mask_holes": (5, 10)}
     ).model_dump(mode="json"),
     "left_out": ["hats"],
     "protocol": "By eye.",
