@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from flows import commands
 from flows.display import display
@@ -222,20 +221,14 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
         "--format", choices=CAMERA_FORMATS, action="append", default=[], help="also write this format; may be repeated"
     )
     boards = command.add_argument_group("from boards")
-    boards.add_argument(
-        "--ground-frame",
-        **_number(int, 0, MAX_COUNT, "N", "frame in which the board lies on the floor: the world's origin"),
-    )
+    what = "frame in which the board lies on the floor: the world's origin"
+    boards.add_argument("--ground-frame", type=_number(int, 0, MAX_COUNT), metavar="N", help=what)
     person = command.add_argument_group("from the person")
-    person.add_argument(
-        "--height",
-        **_number(float, *STATURE_M, "M", "the person's height (default: stature_m of capture.toml, else 1.65)"),
-    )
+    what = "the person's height (default: stature_m of capture.toml, else 1.65)"
+    person.add_argument("--height", type=_number(float, *STATURE_M), metavar="M", help=what)
     person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML file")
-    person.add_argument(
-        "--fov",
-        **_number(float, 1, 170, "DEG", "field of view across the longer side (default: metadata, else estimated)"),
-    )
+    what = "field of view across the longer side (default: metadata, else estimated)"
+    person.add_argument("--fov", type=_number(float, 1, 170), metavar="DEG", help=what)
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
@@ -268,9 +261,8 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     _add_study(benchmark, "dynamic", "benchmark")
     what = "presets or YAML files to compare, like fast,nerf (default: the study's)"
     benchmark.add_argument("--methods", type=_names, metavar="LIST", help=what)
-    benchmark.add_argument(
-        "--seconds", **_number(float, 0.1, 1_000_000, "S", "time limit of each training (default: the study's)")
-    )
+    what = "time limit of each training (default: the study's)"
+    benchmark.add_argument("--seconds", type=_number(float, 0.1, 1_000_000), metavar="S", help=what)
 
 
 def _add_ablate(ablations: argparse.ArgumentParser) -> None:
@@ -295,8 +287,8 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _number(kind: type[float], low: float, high: float, unit: str, what: str) -> dict[str, Any]:
-    """Return how `add_argument` adds a number, int or float; one outside the range is refused, NaN included."""
+def _number(kind: type[float], low: float, high: float) -> Callable[[str], float]:
+    """Return the type of an option that takes such numbers, int or float; others are refused, NaN included."""
 
     def read(text: str) -> float:
         with suppress(ValueError):
@@ -304,7 +296,7 @@ def _number(kind: type[float], low: float, high: float, unit: str, what: str) ->
                 return value
         raise argparse.ArgumentTypeError(f"give {'a whole number' if kind is int else 'a number'} from {low} to {high}")
 
-    return {"type": read, "metavar": unit, "help": what}
+    return read
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
@@ -317,44 +309,26 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     view = render.add_mutually_exclusive_group()
     view.add_argument("--camera", help="look through this recorded camera (default: an orbit)")
     view.add_argument("--path", type=Path, help="fly along these cameras: a JSON list, or a folder")
-    render.add_argument(
-        "--radius", **_number(float, 0.1, MAX_M, "M", "radius of the orbit (default: that of the recorded cameras)")
-    )
-    render.add_argument(
-        "--height",
-        **_number(
-            float, -MAX_M, MAX_M, "M", "height above the person's middle (default: that of the recorded cameras)"
-        ),
-    )
+    what = "radius of the orbit (default: that of the recorded cameras)"
+    render.add_argument("--radius", type=_number(float, 0.1, MAX_M), metavar="M", help=what)
+    what = "height above the person's middle (default: that of the recorded cameras)"
+    render.add_argument("--height", type=_number(float, -MAX_M, MAX_M), metavar="M", help=what)
     render.add_argument(
         "--motion", type=Path, metavar="FILE", help=f"show this motion: {MOTIONS} (default: the captured one)"
     )
     render.add_argument(
         "--frames", default=":", metavar="FIRST:END:STEP", help="frames to show, or one number (default: all)"
     )
-    render.add_argument(
-        "--between", nargs=2, **_number(int, 0, MAX_COUNT, "FRAME", "interpolate between the poses of two frames")
-    )
-    render.add_argument(
-        "--shape",
-        action="append",
-        default=[],
-        metavar="NAME=+X",
-        help="add X to a shape value of the body; may be repeated",
-    )
-    render.add_argument(
-        "--volume", **_number(float, -100, 1000, "PERCENT", "change the body's volume by this, like -40 or 80")
-    )
-    render.add_argument(
-        "--size", **_number(int, *SIZES_PX, "PX", "longest side of an image (default: that of the capture)")
-    )
-    render.add_argument(
-        "--pictures",
-        **_number(
-            int, 1, MAX_COUNT, "N",
-            f"number of images (default: one per pose; {ORBIT_PICTURES} for --between, and for one pose on an orbit)",
-        ),
-    )  # fmt: skip
+    what = "interpolate between the poses of two frames"
+    render.add_argument("--between", nargs=2, type=_number(int, 0, MAX_COUNT), metavar="FRAME", help=what)
+    what = "add X to a shape value of the body; may be repeated"
+    render.add_argument("--shape", action="append", default=[], metavar="NAME=+X", help=what)
+    what = "change the body's volume by this, like -40 or 80"
+    render.add_argument("--volume", type=_number(float, -100, 1000), metavar="PERCENT", help=what)
+    what = "longest side of an image (default: that of the capture)"
+    render.add_argument("--size", type=_number(int, *SIZES_PX), metavar="PX", help=what)
+    what = f"number of images (default: one per pose; {ORBIT_PICTURES} for --between, and for one pose on an orbit)"
+    render.add_argument("--pictures", type=_number(int, 1, MAX_COUNT), metavar="N", help=what)
 
 
 if __name__ == "__main__":
