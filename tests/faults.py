@@ -294,7 +294,7 @@ FAULTS = (
     Fault("folded-weights", "asset/skinning", "joints = taken_by[self.joints]", "joints = self.joints"),
     Fault("game-negative", "asset/skinning", "(found >= 0).all(1) & ", ""),
     Fault("one-eyeball", "asset/rigs", "not all(points.any() for", "not any(points.any() for", "asset/skinning"),
-    Fault("package-twice-scaled", "asset/package", "_set_rate(layer, part.fps)", "_set_rate(layer, 10.0)"),
+    Fault("package-twice-scaled", "asset/package", "_set_units(layer, part.fps)", "_set_units(layer, 10.0)"),
     Fault("package-extents", "asset/package", "for boxes in avatar.extents_m.values()", "for boxes in ()"),
     Fault("correctives-sign", "asset/correctives", "np.vstack([shapes_m, -shapes_m", "np.vstack([shapes_m, shapes_m"),
     Fault("bvh-count", "body/bvh", "if frames * max(width, 3 * len(joints)) > MAX_NUMBERS:", "if False:"),

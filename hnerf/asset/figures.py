@@ -1,5 +1,7 @@
 """Figures of the asset for its report."""
 
+from collections.abc import Iterable
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -54,17 +56,9 @@ def rig_figures(staged: StagedAvatar, name: str) -> dict[str, float]:
     """Return a rig's size, and how far it moves the captured surfaces from where the full rig has them: what 99 % of
     the points stay below in all frames, and the furthest."""
     rig, full = staged.rigs[name], staged.rigs[FULL]
-    worst_m = np.zeros(len(staged.rest_points_m))
-    if rig is not full:
-        pairs = zip(rig.surfaces_m(CAPTURED, staged.rest), full.surfaces_m(CAPTURED, staged.rest), strict=True)
-        for moved, true in pairs:
-            worst_m = np.maximum(worst_m, np.linalg.norm(moved - true, axis=1))
-    return {
-        "joints": len(rig.skeleton.names),
-        "influences": rig.skin.influences,
-        "moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)),
-        "moved_max_mm": float(1e3 * worst_m.max()),
-    }
+    surfaces = [] if rig is full else [one.surfaces_m(CAPTURED, staged.rest) for one in (rig, full)]
+    off_m = (moved - true for moved, true in zip(*surfaces, strict=True))
+    return {"joints": len(rig.skeleton.names), "influences": rig.skin.influences} | _moved_mm(off_m)
 
 
 def splat_figures(staged: StagedAvatar, splats: Splats) -> dict[str, float]:
@@ -73,16 +67,17 @@ def splat_figures(staged: StagedAvatar, splats: Splats) -> dict[str, float]:
     game, full = staged.rigs[GAME], staged.rigs[FULL]
     skin, weights = splats.skin(game), game.motions[CAPTURED].shape_weights
     poses = posed_frames(game.skeleton, game.stage[CAPTURED], staged.rest, weights)
-    worst_m = np.zeros(len(splats.face))
-    for (transforms, points_m), surface_m in zip(poses, full.surfaces_m(CAPTURED, staged.rest), strict=True):
-        off_m = skinned(transforms, skin, splats.at(points_m)) - splats.at(surface_m)
-        worst_m = np.maximum(worst_m, np.linalg.norm(off_m, axis=1))
-    return {
-        "count": len(splats.face),
-        "sigma_mm": 1e3 * splats.sigma_m,
-        "moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)),
-        "moved_max_mm": float(1e3 * worst_m.max()),
-    }
+    off_m = (
+        skinned(transforms, skin, splats.at(points_m)) - splats.at(surface_m)
+        for (transforms, points_m), surface_m in zip(poses, full.surfaces_m(CAPTURED, staged.rest), strict=True)
+    )
+    return {"count": len(splats.face), "sigma_mm": 1e3 * splats.sigma_m} | _moved_mm(off_m)
+
+
+def _moved_mm(off_m: Iterable[np.ndarray]) -> dict[str, float]:
+    """Return what 99 % of points stay below in all frames, and the furthest; off_m: (V, 3) of each frame."""
+    worst_m = reduce(np.maximum, (np.linalg.norm(m, axis=1) for m in off_m), np.zeros(1))
+    return {"moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)), "moved_max_mm": float(1e3 * worst_m.max())}
 
 
 def beyond_skinning_mm(displacements_m: np.ndarray, correctives: Correctives) -> dict[str, float]:

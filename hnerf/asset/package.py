@@ -87,8 +87,7 @@ def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: f
     parts = _parts(avatars, list(cameras), fps)
     for part in parts:
         layer = Usd.Stage.CreateNew(str(folder / f"{part.name}.usdc"))
-        _set_axes(layer)
-        _set_rate(layer, part.fps)
+        _set_units(layer, part.fps)
         layer.SetDefaultPrim(layer.OverridePrim(ROOT))
         part.author(layer)
         layer.GetRootLayer().Save()
@@ -240,8 +239,7 @@ def _time_range(avatars: Avatars, selected: str, fps: float) -> np.ndarray:
 def _new_stage(file: Path, avatars: Avatars, codes: np.ndarray, fps: float, info: AssetInfo) -> Usd.Stage:
     """Return a stage from the first to the last of time codes, with the root prim and what it says of itself."""
     stage = Usd.Stage.CreateNew(str(file))
-    _set_axes(stage)
-    _set_rate(stage, fps)
+    _set_units(stage, fps)
     stage.SetStartTimeCode(float(codes[0]))
     stage.SetEndTimeCode(float(codes[-1]))
     root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
@@ -257,12 +255,9 @@ def _new_stage(file: Path, avatars: Avatars, codes: np.ndarray, fps: float, info
     return stage
 
 
-def _set_axes(stage: Usd.Stage) -> None:
+def _set_units(stage: Usd.Stage, fps: float) -> None:
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-
-
-def _set_rate(stage: Usd.Stage, fps: float) -> None:
     stage.SetTimeCodesPerSecond(fps)
     stage.SetFramesPerSecond(fps)
 
