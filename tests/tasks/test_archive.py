@@ -136,9 +136,20 @@ def unpacked(path: Path) -> list[tuple[str, bytes]]:
         return [(member.name, archive.extractfile(member).read()) for member in archive]  # type: ignore[union-attr]
 
 
-def member_of(manifest: dict[str, Any]) -> tuple[str, bytes]:
+def change_manifest(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    (_, text), *files = unpacked(path)
+    manifest = json.loads(text)
+    change(manifest)
     text = json.dumps(manifest).encode()
-    return manifest_name(text), text
+    repack(path, [(manifest_name(text), text), *files])
+
+
+def refused(packed: Path, why: str | None = None) -> None:
+    """Expect that an archive is refused, and nothing of it is stored."""
+    store = packed.with_name("to")
+    with pytest.raises(InputError, match=why):
+        import_subject(Store(store), packed)
+    assert not store.exists()
 
 
 NAME = f"fit/{11:032x}"
@@ -147,14 +158,13 @@ NAME = f"fit/{11:032x}"
 @pytest.mark.parametrize(
     "path", ["../x", "/x", "a/../../x", "", ".", "a//b", "a/./b", "a\0b", "\ud800", "deep/letters/x", "a" * 2000]
 )
-def test_paths_that_lead_out_are_refused(packed: Path, tmp_path: Path, path: str) -> None:
-    (_, text), *files = unpacked(packed)
-    manifest = json.loads(text)
-    manifest["artifacts"][NAME]["files"][path] = manifest["artifacts"][NAME]["files"]["deep/letters"]
-    repack(packed, [member_of(manifest), *files])
-    with pytest.raises(InputError, match="is not a path inside a folder"):
-        import_subject(Store(tmp_path / "to"), packed)
-    assert not (tmp_path / "to").exists()
+def test_paths_that_lead_out_are_refused(packed: Path, path: str) -> None:
+    def lead_out(manifest: dict[str, Any]) -> None:
+        files = manifest["artifacts"][NAME]["files"]
+        files[path] = files["deep/letters"]
+
+    change_manifest(packed, lead_out)
+    refused(packed, "is not a path inside a folder")
 
 
 @pytest.mark.parametrize(
@@ -176,16 +186,9 @@ def test_paths_that_lead_out_are_refused(packed: Path, tmp_path: Path, path: str
         lambda m: m["artifacts"][NAME]["files"].update(more={"sha256": "0" * 64, "size_bytes": 1}),
     ],
 )
-def test_a_manifest_that_is_none_is_refused(
-    packed: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None]
-) -> None:
-    (_, text), *files = unpacked(packed)
-    manifest = json.loads(text)
-    change(manifest)
-    repack(packed, [member_of(manifest), *files])
-    with pytest.raises(InputError):
-        import_subject(Store(tmp_path / "to"), packed)
-    assert not (tmp_path / "to").exists()
+def test_a_manifest_that_is_none_is_refused(packed: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    change_manifest(packed, change)
+    refused(packed)
 
 
 @pytest.mark.parametrize(
@@ -198,30 +201,23 @@ def test_a_manifest_that_is_none_is_refused(
         ({"name": "../../x"}, "does not name"),
     ],
 )
-def test_members_other_than_named_files_are_refused(
-    packed: Path, tmp_path: Path, changes: dict[str, Any], why: str
-) -> None:
+def test_members_other_than_named_files_are_refused(packed: Path, changes: dict[str, Any], why: str) -> None:
     (manifest, text), *files = unpacked(packed)
     repack(packed, [(manifest, text)])
     whole = packed.read_bytes()[: -(len(packed.read_bytes()) - 512 * (1 + -(-len(text) // 512)))]
     repack(packed, files, **changes)
     packed.write_bytes(whole + packed.read_bytes())
-    with pytest.raises(InputError, match=why):
-        import_subject(Store(tmp_path / "to"), packed)
-    assert not (tmp_path / "to").exists()
+    refused(packed, why)
 
 
-def test_every_cut_and_other_bytes_are_refused(packed: Path, tmp_path: Path) -> None:
+def test_every_cut_and_other_bytes_are_refused(packed: Path) -> None:
     whole = packed.read_bytes()
     end = len(whole.rstrip(b"\0"))
     for length in [0, 1, *range(100, end, 331)]:
         packed.write_bytes(whole[:length])
-        with pytest.raises(InputError):
-            import_subject(Store(tmp_path / "to"), packed)
+        refused(packed)
     packed.write_bytes(whole[: end - 1] + b"?" + whole[end:])
-    with pytest.raises(InputError, match="damaged or cut short"):
-        import_subject(Store(tmp_path / "to"), packed)
-    assert not (tmp_path / "to").exists()
+    refused(packed, "damaged or cut short")
 
 
 def test_what_would_fill_the_disk_is_refused(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,17 +228,16 @@ def test_what_would_fill_the_disk_is_refused(packed: Path, tmp_path: Path, monke
 
 def test_a_file_under_many_paths_counts_as_often(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else an archive of a gigabyte could ask for its digest a hundred thousand times."""
-    (_, text), *files = unpacked(packed)
-    manifest = json.loads(text)
-    letters = manifest["artifacts"][NAME]["files"]["deep/letters"]
-    free = module.SPARE_BYTES + 50 * letters["size_bytes"]
+
+    def repeat(manifest: dict[str, Any]) -> None:
+        files = manifest["artifacts"][NAME]["files"]
+        files |= {f"again/{number}": files["deep/letters"] for number in range(50)}
+
+    free = module.SPARE_BYTES + 50 * len("abc 11")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     import_subject(Store(tmp_path / "once"), packed)
-    manifest["artifacts"][NAME]["files"] |= {f"again/{number}": letters for number in range(50)}
-    repack(packed, [member_of(manifest), *files])
-    with pytest.raises(InputError, match="make room"):
-        import_subject(Store(tmp_path / "to"), packed)
-    assert not (tmp_path / "to").exists()
+    change_manifest(packed, repeat)
+    refused(packed, "make room")
 
 
 def test_what_a_killed_import_left_is_collected(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -153,11 +154,13 @@ def test_what_cannot_be_found_goes_unless_a_subject_links_to_it(store: Store) ->
     assert left == {one.root.name for one in now[1:4]} and (now[3].root / "deep" / "letters").exists()
 
 
-def test_a_record_that_was_made_anew_meanwhile_stays(store: Store) -> None:
+@pytest.mark.parametrize("lose", [lambda record: record.write_text("{"), Path.unlink])
+def test_what_is_recorded_meanwhile_stays(store: Store, lose: Callable[[Path], object]) -> None:
+    """A damaged record is made anew, or a folder gets its name and then its record."""
     made = add(store, "fit", 90)
     record = store.path("fit", f"{90:032x}", ".json")
     text = record.read_text()
-    record.write_text("{")
+    lose(record)
     (one,) = find_garbage(Inventory.of(store), 1, 0)
     record.write_text(text)
     os.utime(record, (LONG_AGO_S,) * 2)
@@ -176,16 +179,6 @@ def test_work_that_was_resumed_meanwhile_stays(store: Store) -> None:
     (one,) = find_garbage(Inventory.of(store), 1, 0)
     (partial / "checkpoint").touch()
     assert not collect(store, one) and partial.exists()
-
-
-def test_what_was_about_to_be_recorded_stays(store: Store) -> None:
-    """A folder gets its name, and then its record."""
-    made = add(store, "fit", 90)
-    record = store.path("fit", f"{90:032x}", ".json")
-    record.rename(record.with_suffix(".away"))
-    (one,) = find_garbage(Inventory.of(store), 1, 0)
-    record.with_suffix(".away").rename(record)
-    assert not collect(store, one) and store.find("fit", f"{90:032x}") == made
 
 
 def test_a_lock_that_was_removed_under_a_waiting_process_holds_nobody_apart(store: Store) -> None:

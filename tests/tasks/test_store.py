@@ -6,7 +6,9 @@ import shutil
 import signal
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -165,28 +167,27 @@ def test_a_record_of_another_stage_is_none(tmp_path: Path) -> None:
     assert Store(tmp_path).find("training", "k") == made and Store(tmp_path).find("fit", "k") is None
 
 
-@pytest.mark.parametrize("victim", ["k/deep/letters", "k.json"])
-@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_text("abd")])
-def test_damaged_or_deleted_artifact_is_made_again(tmp_path: Path, victim: str, damage) -> None:  # type: ignore[no-untyped-def]
+NO_RECORDS = ("abd", "[]", "null", "3", '"text"', "[" * 100_000, '{"stage": "fit", "files": []}')
+
+
+@pytest.mark.parametrize(
+    ("victim", "damage"),
+    [
+        ("k/deep/letters", Path.unlink),
+        ("k/deep/letters", lambda path: path.write_text("abd")),
+        ("k.json", Path.unlink),
+        *(("k.json", partial(Path.write_text, data=text)) for text in NO_RECORDS),
+        ("k.json", lambda path: os.truncate(path, 10**13)),  # it occupies nothing, and is not read
+    ],
+)
+def test_damaged_or_deleted_artifact_is_made_again(
+    tmp_path: Path, victim: str, damage: Callable[[Path], object]
+) -> None:
     made = Store(tmp_path).get_or_compute("fit", "k", write_abc)
     damage(tmp_path / "fit" / victim)
     assert Store(tmp_path).find("fit", "k") is None
     assert Store(tmp_path).get_or_compute("fit", "k", write_abc) == made
     assert Store(tmp_path).find("fit", "k") == made
-
-
-@pytest.mark.parametrize("text", ["[]", "null", "3", '"text"', "[" * 100_000, '{"stage": "fit", "files": []}'])
-def test_a_record_that_is_none_is_made_again(tmp_path: Path, text: str) -> None:
-    made = Store(tmp_path).get_or_compute("fit", "k", write_abc)
-    (tmp_path / "fit" / "k.json").write_text(text)
-    assert Store(tmp_path).get_or_compute("fit", "k", write_abc) == made
-
-
-def test_a_record_of_gigabytes_is_not_read(tmp_path: Path) -> None:
-    """Of a file that occupies nothing."""
-    made = Store(tmp_path).get_or_compute("fit", "k", write_abc)
-    os.truncate(tmp_path / "fit" / "k.json", 10**13)
-    assert Store(tmp_path).get_or_compute("fit", "k", write_abc) == made
 
 
 def test_links_planted_in_the_store_are_not_followed(tmp_path: Path) -> None:
