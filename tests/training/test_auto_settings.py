@@ -1,6 +1,6 @@
 """Automatic settings by hand, and the measurement of a scene."""
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +45,7 @@ def test_sizes_by_hand():
 
 def test_no_finer_than_frames_align():
     """Pixels of 1 mm would give 1920 cells; frames align to 1 cm."""
-    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.001}))[0].field
+    fast = decided(replace(SCENE, footprint_m=0.001))[0].field
     assert fast.colour_cells[-1] == 192
     assert fast.geometry_cells[-1] == 128
 
@@ -54,7 +54,7 @@ def test_no_finer_than_frames_align():
 def test_one_posture_is_as_fine_as_its_pixels(nearly_static: dict):
     """Cells shrink to 8 mm: 240 on 1.92 m, 160 for geometry, a sample per 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
     for footprint_m in (0.008, 0.001):
-        settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **nearly_static}))
+        settings, decisions = decided(replace(SCENE, footprint_m=footprint_m, **nearly_static))
         assert (settings.field.colour_cells[-1], settings.field.geometry_cells[-1]) == (240, 160)
         assert settings.field.samples == 40
         assert "there is one posture: cells of 8.0 mm" in decisions["field.colour_cells"].reason
@@ -68,15 +68,8 @@ def test_geometry_follows_the_colours_cells_that_are_given():
 def test_what_is_given_stands():
     settings, decisions = decided(SCENE, steps=7, field={"kind": "fast", "samples": 5, "outer_m": 0.2})
     assert (settings.steps, settings.field.samples, settings.field.outer_m) == (7, 5, 0.2)
-    assert set(decisions) == {
-        "field.inner_m",
-        "field.colour_cells",
-        "field.geometry_cells",
-        "field.pose_width",
-        "field.nodes",
-        "one_posture",
-        "ground",
-    }
+    open_ones = ("inner_m", "colour_cells", "geometry_cells", "pose_width", "nodes")
+    assert set(decisions) == {*(f"field.{name}" for name in open_ones), "one_posture", "ground"}
 
 
 def test_samples_follow_a_shell_that_is_given():
@@ -86,13 +79,13 @@ def test_samples_follow_a_shell_that_is_given():
 
 def test_a_shell_is_no_thicker_than_fifteen_centimetres():
     """A skirt reaches 30 cm out of the body: 2.4 x (15 + 3) cm / 6 mm = 72."""
-    fast = decided(SCENE.__class__(**{**vars(SCENE), "outside_m": 0.3}))[0].field
+    fast = decided(replace(SCENE, outside_m=0.3))[0].field
     assert (fast.outer_m, fast.inner_m, fast.samples) == (0.15, 0.03, 72)
 
 
 def test_a_person_far_away_has_one_level():
     """Pixels of 10 cm: 19 cells on 1.92 m, fewer than the 24 of a coarsest level, and 13 of geometry, than 16."""
-    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.1}))[0].field
+    fast = decided(replace(SCENE, footprint_m=0.1))[0].field
     assert (fast.colour_cells, fast.geometry_cells) == ((19,), (13,))
 
 
@@ -101,14 +94,14 @@ def test_a_person_far_away_has_one_level():
 )
 def test_frames_that_were_fitted_with_one_posture_keep_one(kind: str, std_rad: float, one: bool):
     """The published method gives each frame its own posture; a given setting is kept."""
-    scene = SCENE.__class__(**{**vars(SCENE), "std_rad": std_rad})
+    scene = replace(SCENE, std_rad=std_rad)
     assert decided(scene, field={"kind": kind})[0].one_posture is one
     assert decided(scene, one_posture=not one)[0].one_posture is not one
 
 
 @pytest.mark.parametrize(("person_px", "steps"), [(1000, 600), (10**9, 4000)])
 def test_steps_have_bounds(person_px: int, steps: int):
-    assert decided(SCENE.__class__(**{**vars(SCENE), "person_px": person_px}))[0].steps == steps
+    assert decided(replace(SCENE, person_px=person_px))[0].steps == steps
 
 
 @pytest.mark.parametrize(
@@ -118,14 +111,14 @@ def test_steps_have_bounds(person_px: int, steps: int):
 def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frames: int, rate: float, steps: int):
     """540 steps per frame for 40 frames at 10 frames per step are 2160; one frame or given poses need no depth
     search."""
-    scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames, "person_px": 1000})
+    scene = replace(SCENE, cameras=cameras, frames=frames, person_px=1000)
     settings, decisions = decided(scene, pose_learning_rate=rate)
     assert settings.steps == steps
     assert ("depths of 40 bodies" in decisions["steps"].reason) == (steps == 2160)
 
 
 def test_one_pose_teaches_nothing_about_poses():
-    settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "std_rad": 0.01}))
+    settings, decisions = decided(replace(SCENE, std_rad=0.01))
     assert settings.field.pose_width == 1
     assert decisions["field.pose_width"].reason.endswith("too little to learn from")
 
@@ -134,7 +127,7 @@ def test_one_pose_teaches_nothing_about_poses():
     ("cameras", "frames", "rate", "nodes"), [(4, 24, 1e-3, 128), (4, 1, 1e-3, 0), (1, 24, 1e-3, 0), (4, 24, 0.0, 0)]
 )
 def test_a_single_frame_or_camera_does_not_deform_the_body(cameras: int, frames: int, rate: float, nodes: int):
-    scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames})
+    scene = replace(SCENE, cameras=cameras, frames=frames)
     assert decided(scene, field={"kind": "fast", "deformation_learning_rate": rate})[0].field.nodes == nodes
 
 
@@ -149,7 +142,7 @@ def test_a_single_frame_or_camera_does_not_deform_the_body(cameras: int, frames:
     ],
 )
 def test_the_ground_is_where_feet_stand_if_nobody_stands_lower(lowest_m: tuple[float, float], ground: bool):
-    scene = SCENE.__class__(**{**vars(SCENE), "lowest_m": lowest_m})
+    scene = replace(SCENE, lowest_m=lowest_m)
     assert decided(scene)[0].ground is ground
     assert decided(scene, ground=not ground)[0].ground is not ground
 
@@ -189,6 +182,6 @@ def test_shells_hold_99_of_100_outline_points(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(auto_settings, "_outline_distance_px", lambda mask, covered: np.arange(-50.0, 51.0))
     monkeypatch.setattr(auto_settings, "MASKS_PER_CAMERA", 1)
     capture, masks, body = record(tmp_path)
-    scene = SceneStatistics.of(dataclasses.replace(capture, train_cameras=("0",)), masks, body)
+    scene = SceneStatistics.of(replace(capture, train_cameras=("0",)), masks, body)
     assert scene.outside_m == pytest.approx(49 * scene.footprint_m)
     assert scene.inside_m == pytest.approx(49 * scene.footprint_m)
