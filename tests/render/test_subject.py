@@ -49,6 +49,25 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def copy(subject: Path, tmp_path: Path) -> Path:
+    """Copy the subject, to be damaged."""
+    return shutil.copytree(subject, tmp_path / "copy")
+
+
+@pytest.fixture
+def refusal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Return what renders in vain, leaves nothing behind, and returns the one line that says why."""
+
+    def refused(subject: Path, *options: str) -> str:
+        assert main(["render", str(subject), "--out", str(tmp_path / "out"), *options]) == 2
+        assert not (tmp_path / "out").exists()
+        (line,) = capsys.readouterr().err.splitlines()
+        return line
+
+    return refused
+
+
 def numbers(out: Path, kind: str) -> list[str]:
     return sorted(path.stem for path in (out / kind).iterdir())
 
@@ -180,23 +199,17 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
     ],
 )
 def test_a_wish_that_cannot_be_met_is_one_line(
-    options: list[str], message: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], message: str, subject: Path, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
-    assert main(["render", str(subject), "--out", str(tmp_path / "out"), *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
+    assert message in refusal(subject, *options)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("options", [["--between", "0", "1"], ["--volume", "5"], ["--shape", "height=0.1"]])
-def test_a_model_of_moments_shows_no_other(
-    options: list[str], subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = shutil.copytree(subject, tmp_path / "column")
+def test_a_model_of_moments_shows_no_other(options: list[str], copy: Path, refusal: Callable[..., str]) -> None:
     stored = {"static": True, "training": load_settings("nerfies").training.model_dump()}
     (copy / "training" / "settings.json").write_text(json.dumps(stored))
-    assert main(["render", str(copy), "--out", str(tmp_path / "out"), *options]) == 2
-    assert "column: Nerfies has no pose to set" in capsys.readouterr().err
+    assert "copy: Nerfies has no pose to set" in refusal(copy, *options)
 
 
 def test_what_is_there_is_not_written_over(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,9 +217,8 @@ def test_what_is_there_is_not_written_over(subject: Path, tmp_path: Path, capsys
     assert "exists; give the name of a new folder" in capsys.readouterr().err
 
 
-def test_a_folder_that_is_no_subject_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["render", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    assert "capture.json: missing; give <store>/subjects/<name>" in capsys.readouterr().err
+def test_a_folder_that_is_no_subject_is_refused(tmp_path: Path, refusal: Callable[..., str]) -> None:
+    assert "capture.json: missing; give <store>/subjects/<name>" in refusal(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -222,15 +234,11 @@ def test_a_folder_that_is_no_subject_is_refused(tmp_path: Path, capsys: pytest.C
     ],
 )
 def test_a_copy_with_a_file_that_is_cut_is_one_line(
-    file: str, named: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    file: str, named: str, copy: Path, refusal: Callable[..., str]
 ) -> None:
-    copy = shutil.copytree(subject, tmp_path / "copy")
     (copy / file).write_bytes((copy / file).read_bytes()[: (copy / file).stat().st_size // 2])
-    view = ["--camera", "0", "--frames", "0"]
-    assert main(["render", str(copy), "--out", str(tmp_path / "out"), *view]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refusal(copy, "--camera", "0", "--frames", "0")
     assert line.startswith(f"hnerf: {copy / named}: damaged, or written by another version (")
-    assert not (tmp_path / "out").exists()
 
 
 def _set(**changes: object) -> Callable[[Path], object]:
@@ -288,17 +296,12 @@ NONSENSE = {
 
 
 @pytest.mark.parametrize("case", NONSENSE)
-def test_a_copy_that_parses_and_makes_no_sense_is_one_line(
-    case: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_copy_that_parses_and_makes_no_sense_is_one_line(case: str, copy: Path, refusal: Callable[..., str]) -> None:
     """Deep nesting overflows the stack of OpenCV's own parser."""
     damage, message = NONSENSE[case]
-    copy = shutil.copytree(subject, tmp_path / "copy")
     damage(copy)
-    assert main(["render", str(copy), "--out", str(tmp_path / "out"), "--frames", "0", "--pictures", "1"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refusal(copy, "--frames", "0", "--pictures", "1")
     assert line.startswith(f"hnerf: {copy}/") and message in line
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -313,28 +316,15 @@ def test_a_copy_that_parses_and_makes_no_sense_is_one_line(
     ],
 )
 def test_a_copy_whose_arrays_do_not_fit_each_other_is_one_line(
-    file: str,
-    name: str,
-    array: np.ndarray,
-    message: str,
-    subject: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    file: str, name: str, array: np.ndarray, message: str, copy: Path, refusal: Callable[..., str]
 ) -> None:
-    copy = shutil.copytree(subject, tmp_path / "copy")
     with np.load(copy / "training" / file) as stored:
         np.savez(copy / "training" / file, **{**stored, name: array})
-    assert main(["render", str(copy), "--out", str(tmp_path / "out")]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refusal(copy)
     assert line.startswith(f"hnerf: {copy / 'training'}: damaged, or written by another version (") and message in line
 
 
-def test_a_motion_of_another_version_is_one_line(
-    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = shutil.copytree(subject, tmp_path / "copy")
-    stored = json.loads((copy / "capture/capture.json").read_text())
-    (copy / "capture/capture.json").write_text(json.dumps(stored | {"lens": 1}))
-    assert main(["render", str(subject), "--out", str(tmp_path / "out"), "--motion", str(copy)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+def test_a_motion_of_another_version_is_one_line(subject: Path, copy: Path, refusal: Callable[..., str]) -> None:
+    _set(lens=1)(copy)
+    line = refusal(subject, "--motion", str(copy))
     assert line.startswith(f"hnerf: {copy / 'capture/capture.json'}: damaged, or written by another version (")
