@@ -4,12 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.avatar.trained import build_field
 from hnerf.baselines.idr import SdfNetwork, intersection, trace_surface
 from hnerf.config import load_settings
-from hnerf.errors import InputError
 from hnerf.fields.rays import Rays
-from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
+from tests.baselines.ball import RADIUS_M, RING, inner_psnr, psnr, radii_m, trained
 
 SMALL = [
     "training.steps=150",
@@ -117,11 +115,6 @@ def test_starts_as_a_sphere() -> None:
     inside = network(directions[:, None] * steps[:, None])[0] < 0
     assert ((inside[:, 1:] != inside[:, :-1]).sum(1) == 1).all()
     assert inside.sum(1).float().mean() / 200 == pytest.approx(0.4, abs=0.05)
-
-
-def test_more_than_one_moment_is_refused() -> None:
-    with pytest.raises(InputError, match="IDR models one moment"):
-        build_field(load_settings("idr").training.field, body(), static=False)
 
 
 def test_overfits_the_ball(tmp_path: Path) -> None:

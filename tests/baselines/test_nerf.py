@@ -113,9 +113,10 @@ def test_distance_to_a_box_by_hand() -> None:
     torch.testing.assert_close(boxes.signed_distance(points), torch.tensor([-1.0, -0.25, 1.0, 3**0.5]))
 
 
-def test_more_than_one_moment_is_refused() -> None:
-    with pytest.raises(InputError, match="NeRF models one moment"):
-        build_field(load_settings("nerf").training.field, body(), static=False)
+@pytest.mark.parametrize("method", ["NeRF", "IDR"])
+def test_more_than_one_moment_is_refused(method: str) -> None:
+    with pytest.raises(InputError, match=f"{method} models one moment"):
+        build_field(load_settings(method.lower()).training.field, body(), static=False)
 
 
 def test_overfits_the_ball(tmp_path: Path) -> None:

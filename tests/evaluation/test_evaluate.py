@@ -24,6 +24,7 @@ from hnerf.evaluation.evaluate import PROTOCOL, evaluate, mesh_frames, protocol_
 from hnerf.evaluation.geometry import score_geometry
 from hnerf.evaluation.ground_truth import GIVEN_MASKED_IMAGE, MASKED_IMAGE, UNDER_GIVEN_MASKS, truth_of
 from hnerf.evaluation.images import render
+from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.metrics import mask_box
 from hnerf.evaluation.views import View
 from tests.evaluation.ball import (
@@ -85,10 +86,7 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
 def unscored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
     """Evaluate a subject without ground truth and without test cameras, whose name is markup."""
     base = tmp_path_factory.mktemp("unscored")
-    inputs = ball_inputs(write_ball_capture(base / "capture", HOSTILE, ()), base / "stages")
-    out = base / "evaluation"
-    out.mkdir()
-    return out, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1), out)
+    return evaluated(base, ball_inputs(write_ball_capture(base / "capture", HOSTILE, ()), base / "stages"))
 
 
 def test_image_figures_by_hand(scored: Scored) -> None:
@@ -110,10 +108,7 @@ def test_the_report_may_show_more_images_than_are_scored(tmp_path: Path) -> None
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
-    out = tmp_path / "evaluation"
-    out.mkdir()
-    settings = EvaluationSettings(max_images=1, max_meshes=1, report_rows=3)
-    found = evaluate(ball_inputs(capture, tmp_path / "stages"), settings, out)
+    out, found = evaluated(tmp_path, ball_inputs(capture, tmp_path / "stages"), max_images=1, report_rows=3)
     assert found["novel_view"]["n"] == 1 and (out / "report.html").is_file()
 
 
@@ -124,7 +119,7 @@ def test_few_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> N
     (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
     for frame in (0, 2):
         (capture.root / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
-    _, found = evaluated(tmp_path, capture, max_images=2)
+    _, found = unreported(tmp_path, capture, max_images=2)
     assert [row["frame"] for row in found["novel_view"]["per_image"]] == [1]
 
 
@@ -228,15 +223,20 @@ def test_the_report_shows_all_three_side_by_side(scored: Scored) -> None:
     assert "not trained on, in poses as fitted before training" in text
 
 
-def evaluated(base: Path, capture: Capture, kind: str = "fast", **settings: Any) -> Scored:
-    """Evaluate a ball without a report; return the folder and what was found."""
-    inputs = ball_inputs(capture, base / "stages")
-    write_settings(inputs.training_folder, kind)
+def evaluated(base: Path, inputs: EvaluationInputs, **settings: Any) -> Scored:
+    """Evaluate a ball; return the folder and what was found."""
     out = base / "evaluation"
     out.mkdir()
+    return out, evaluate(inputs, EvaluationSettings(**{"max_meshes": 1, "report_rows": 1} | settings), out)
+
+
+def unreported(base: Path, capture: Capture, kind: str = "fast", **settings: Any) -> Scored:
+    """Evaluate a ball that a kind of field was trained on, without a report."""
+    inputs = ball_inputs(capture, base / "stages")
+    write_settings(inputs.training_folder, kind)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "write_report", lambda *_: None)
-        return out, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1, **settings), out)
+        return evaluated(base, inputs, **settings)
 
 
 class Mist(BallAvatar):
@@ -250,10 +250,7 @@ def test_a_field_without_a_surface_has_images_and_a_reason(tmp_path: Path) -> No
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     inputs = ball_inputs(capture, tmp_path / "stages")
-    out = tmp_path / "evaluation"
-    out.mkdir()
-    inputs = dataclasses.replace(inputs, avatar=Mist(inputs.fitted))
-    evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1), out)
+    out, _ = evaluated(tmp_path, dataclasses.replace(inputs, avatar=Mist(inputs.fitted)))
     found = json.loads((out / "metrics.json").read_text())
     reason = "no surface in its box (everything is outside)"
     for split in ("novel_view", "novel_pose"):
@@ -267,7 +264,7 @@ def test_a_surface_without_truth_is_a_surface(unscored: Scored) -> None:
 
 
 def test_a_method_that_tunes_nothing_has_one_column(tmp_path: Path) -> None:
-    out, found = evaluated(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "neural_body")
+    out, found = unreported(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "neural_body")
     assert found["novel_pose_posed"]["reason"] == "no pose of these frames was tuned"
     assert found["novel_pose_tracked"]["reason"] == "these frames have no deformation of their own"
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_pose", "novel_view", "training_view"]
@@ -279,9 +276,7 @@ def test_test_cameras_without_truth_are_scored_under_the_masks_of_the_recording(
     """Of two test cameras only c has masks, in which the ball lacks its left half; expect that and an even picture."""
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c", "d"))
     write_ball_masks(capture, "c")
-    (tmp_path / "evaluation").mkdir()
-    settings = EvaluationSettings(max_meshes=1, report_rows=1)
-    found = evaluate(ball_inputs(capture, tmp_path / "stages"), settings, tmp_path / "evaluation")
+    out, found = evaluated(tmp_path, ball_inputs(capture, tmp_path / "stages"))
     whole = seen(TEST_CAMERA, centre_m(3))
     half = whole & (np.arange(whole.shape[1]) >= whole.shape[1] // 2)
     error = (whole * RENDERED / 255 - half * PHOTOGRAPHED / 255)[mask_box(half)]
@@ -292,7 +287,7 @@ def test_test_cameras_without_truth_are_scored_under_the_masks_of_the_recording(
     assert found["novel_view"]["reference"] == "photograph x given mask"
     assert "no ground-truth surface" in found["novel_view"]["geometry_reason"]
     assert found["protocol"] == f"{PROTOCOL} Here, images are compared to {UNDER_GIVEN_MASKS}."
-    text = html.unescape((tmp_path / "evaluation" / "report.html").read_text())
+    text = html.unescape((out / "report.html").read_text())
     assert text.count(f"New poses, tracked: compared to {UNDER_GIVEN_MASKS}") == 2  # below the figures and in the notes
     assert 'alt="Ground truth"' not in text and text.count('alt="Input × mask"') > 1  # not only the training view's
 
@@ -315,7 +310,7 @@ def test_masks_of_training_cameras_score_nothing(tmp_path: Path) -> None:
 
 
 def test_a_method_without_poses_shows_no_new_ones(tmp_path: Path) -> None:
-    out, found = evaluated(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "nerfies")
+    out, found = unreported(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "nerfies")
     assert "Nerfies has no pose to set" in found["novel_pose"]["reason"]
     assert "Nerfies has no pose to set" in found["novel_pose"]["geometry_reason"]
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_view", "training_view"]
@@ -326,7 +321,7 @@ def test_nothing_is_scored_on_pixels_of_training_cameras(tmp_path: Path) -> None
     """Give the truth of every image."""
     capture = write_ball_capture(tmp_path / "capture", "ball", ())
     write_ball_truth(capture, RADIUS_M)
-    out, found = evaluated(tmp_path, capture)
+    out, found = unreported(tmp_path, capture)
     for split in ("novel_view", "novel_pose", "novel_pose_posed", "novel_pose_tracked"):
         assert (found[split]["n"], found[split]["psnr"], found[split]["per_image"]) == (0, None, [])
     assert "evaluation.holdout" in found["novel_pose"]["reason"]

@@ -47,11 +47,17 @@ def standing() -> tuple[PosedBodies, Conditions]:
     return PosedBodies(RIG, theta, root, RIG.vertices_m), Conditions.of(RIG, theta, root, torch.zeros(1).long(), 2.5)
 
 
-def field_of(sharpness_per_m: float) -> FastField:
+def field_of(sharpness_per_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
     torch.manual_seed(0)
-    field = FastField(RIG, SETTINGS, 1)
+    field = FastField(RIG, settings, 1)
     field.log_sharpness.data.fill_(sharpness_per_m).log_()
     return field
+
+
+def from_above(*origins_m: tuple[float, float, float]) -> Rays:
+    """Return rays along -z at the first body."""
+    down = torch.tensor([[0.0, 0.0, -1.0]]).expand(len(origins_m), 3)
+    return Rays(torch.tensor(origins_m), down, torch.zeros(len(origins_m), dtype=torch.long))
 
 
 def test_the_shell_is_tightened_to_where_the_opacity_changes():
@@ -71,9 +77,7 @@ def test_the_shell_is_tightened_to_where_the_opacity_changes():
 def test_a_tight_shell_shows_the_same_picture():
     bodies, conditions = standing()
     field = field_of(1000.0)
-    origins = torch.tensor([[0.5, 0.4, 3.0], [0.31, 0.62, 3.0], [0.1, 0.8, 3.0]])
-    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
-    rays = Rays(origins, directions, torch.zeros(3, dtype=torch.long))
+    rays = from_above((0.5, 0.4, 3.0), (0.31, 0.62, 3.0), (0.1, 0.8, 3.0))
     draws = Draws.deterministic(3, SETTINGS.samples, torch.device("cpu"))
 
     def coverage() -> torch.Tensor:
@@ -89,8 +93,7 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
     """The middle one of three rays passes 1 m beside the box; the results of the others do not depend on it."""
     bodies, conditions = standing()
     field = field_of(100.0)
-    origins = torch.tensor([[0.5, 0.5, 3.0], [2.0, 0.5, 3.0], [0.4, 0.6, 3.0]])
-    rays = Rays(origins, torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3), torch.zeros(3, dtype=torch.long))
+    rays = from_above((0.5, 0.5, 3.0), (2.0, 0.5, 3.0), (0.4, 0.6, 3.0))
     scene = field.scene(bodies, conditions)
 
     def sampled(pick: list[int]) -> list[torch.Tensor]:
@@ -113,9 +116,8 @@ def test_beyond_its_thickness_the_shell_sees_nothing():
     bodies, conditions = standing()
     field = field_of(100.0)
     field.outer_m.fill_(0.02)
-    rays = Rays(torch.tensor([[0.5, 0.4, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long))
     draws = Draws.deterministic(1, 64, torch.device("cpu"))
-    found, depths = field.sample(field.scene(bodies, conditions), rays, draws)
+    found, depths = field.sample(field.scene(bodies, conditions), from_above((0.5, 0.4, 3.0)), draws)
     above_m = 3.0 - depths[0] - RIG.vertices_m[:, 2].max()
     far, close = above_m > 0.0201, (above_m > 0) & (above_m < 0.0199)
     assert far.any() and close.any()
@@ -151,9 +153,7 @@ def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monk
 
 def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
     """Return a field whose surface lies deeper than the body everywhere in the shell."""
-    torch.manual_seed(0)
-    field = FastField(RIG, settings, 1)
-    field.log_sharpness.data.fill_(500.0).log_()
+    field = field_of(500.0, settings)
     last = field.field.geometry[-1]
     assert isinstance(last, torch.nn.Linear)
     last.bias.data.fill_(distance_m / settings.outer_m)
@@ -166,8 +166,7 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
     nothing."""
     bodies, conditions = standing()
     field = deeper_by(0.1)
-    origins, directions = torch.tensor([[0.5, 0.5, 3.0], [-0.05, 0.5, 3.0]]), -torch.eye(3)[[2, 2]]
-    rays = Rays(origins, directions, torch.zeros(2, dtype=torch.long))
+    rays = from_above((0.5, 0.5, 3.0), (-0.05, 0.5, 3.0))
     scene = field.scene(bodies, conditions)
     count = int(field.samples_needed(scene.region, rays)[0])
     draws = Draws.deterministic(2, count, torch.device("cpu"))
@@ -187,9 +186,8 @@ def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
     bodies, conditions = standing()
     field = deeper_by(0.07, settings)
     field.tighten(RIG, conditions.pose)
-    ray = Rays(torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long))
     with torch.no_grad():
-        seen = field.render_rays(field.scene(bodies, conditions), ray)[0]
+        seen = field.render_rays(field.scene(bodies, conditions), from_above((0.5, 0.5, 3.0)))[0]
     top_m = 3 - bodies.vertices_m[0, :, 2].max().item()
     assert seen[3] == pytest.approx(1, abs=0.01) and seen[4].item() - top_m == pytest.approx(0.07, abs=0.01)
 
@@ -226,10 +224,9 @@ def test_all_that_a_ray_sees_is_coloured(monkeypatch: pytest.MonkeyPatch) -> Non
     bodies, conditions = standing()
     field = field_of(40.0)
     monkeypatch.setattr(type(field.field), "colour", lambda _, y, *__: torch.ones_like(y))
-    rays = Rays(torch.tensor([[0.5, 0.4, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long))
+    draws = Draws.deterministic(1, 64, torch.device("cpu"))
     with torch.no_grad():
-        scene, draws = field.scene(bodies, conditions), Draws.deterministic(1, 64, torch.device("cpu"))
-        samples, depths = field.sample(scene, rays, draws)
+        samples, depths = field.sample(field.scene(bodies, conditions), from_above((0.5, 0.4, 3.0)), draws)
     seen = composited(samples, depths)[0]
     assert 3 < int((samples.colour[0, :, 0] > 0).sum()) < 64
     torch.testing.assert_close(seen[:3], seen[3].expand(3))
@@ -245,12 +242,13 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
     field.inner_m.fill_(0.07)
     field.deformation.displacement.data[:2, 0, 2] = torch.tensor([0.02, 0.06])
     bodies, _ = standing()
-    ray = Rays(torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long))
 
     def ends(moment: int) -> torch.Tensor:
         """Return the depths of the first and the last sample on a ray from above."""
         moments = Conditions.of(RIG, bodies.theta, bodies.root, torch.tensor([moment]), 2.5)
-        depths, _, core = field.region(bodies, moments).sample_rays(ray, torch.full((1, 64), 0.5))
+        depths, _, core = field.region(bodies, moments).sample_rays(
+            from_above((0.5, 0.5, 3.0)), torch.full((1, 64), 0.5)
+        )
         assert core.all()
         return depths[0, [0, -1]]
 
