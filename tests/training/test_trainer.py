@@ -113,8 +113,7 @@ def test_the_paper_learns_by_its_nine_losses_and_fog(tmp_path: Path, monkeypatch
 
 def test_loads_after_the_shape_has_changed(tmp_path: Path):
     """The grids' extent is that of the body before its shape was tuned, whatever the tuned shape is."""
-    capture, masks, body = record(tmp_path / "capture")
-    trainer = Trainer(capture, masks, body, TINY, tmp_path, ALONE)
+    trainer = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
     with torch.no_grad():
         trainer.objective.correction.shape += 0.2  # 20 cm taller
     trainer.run()
@@ -128,8 +127,7 @@ def test_loads_after_the_shape_has_changed(tmp_path: Path):
 def test_time_ends_the_field_and_slows_it_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """With steps of a quarter of a second, one second is over after four of them, when rates have fallen to a tenth;
     the novel poses still get their four."""
-    capture, masks, body = record(tmp_path / "capture")
-    trainer = Trainer(capture, masks, body, tiny(seconds=1.0, steps=1000), tmp_path, ALONE)
+    trainer = Trainer(*record(tmp_path / "capture"), tiny(seconds=1.0, steps=1000), tmp_path, ALONE)
     monkeypatch.setattr(trainer_module, "WARM_UP_STEPS", 1)
     now_s = 0.0
 
@@ -171,8 +169,7 @@ def test_a_checkpoint_without_the_snapshots_before_it_is_discarded(
 
 
 def test_a_model_of_another_version_is_refused(tmp_path: Path):
-    capture, masks, body = record(tmp_path / "capture")
-    Trainer(capture, masks, body, tiny(steps=1, novel_pose_steps=0), tmp_path, ALONE).run()
+    Trainer(*record(tmp_path / "capture"), tiny(steps=1, novel_pose_steps=0), tmp_path, ALONE).run()
     tensors = load_file(tmp_path / "model.safetensors")
     save_file({name: t for name, t in tensors.items() if name != "outer_m"}, tmp_path / "model.safetensors")
     with pytest.raises(InputError, match=r"model.safetensors: written by another version; train the subject again"):
@@ -260,8 +257,7 @@ def test_a_single_training_frame_has_nothing_to_deform(tmp_path: Path):
 def test_not_a_number_stops_the_run_with_its_cause(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    capture, masks, body = record(tmp_path / "capture")
-    trainer = Trainer(capture, masks, body, TINY, tmp_path, ALONE)
+    trainer = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
     before = {name: p.clone() for name, p in trainer.field.named_parameters()}
     poisoned = trainer.objective.forward
 
