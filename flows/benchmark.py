@@ -16,7 +16,7 @@ from hnerf.errors import InputError, one_line
 from hnerf.evaluation.ground_truth import truth_of
 from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import is_flat, training_limits_s
-from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
+from hnerf.study.benchmark.plan import BenchmarkStudy, CapturePart, Variant, load_study
 from hnerf.study.benchmark.publish import publish, table_of
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated_capture
@@ -24,7 +24,7 @@ from tasks.capture import ingest, subset_capture
 from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
 from tasks.source import GROUND_TRUTH, Source, read_capture
-from tasks.store import Store
+from tasks.store import Artifact, Store
 from tasks.training import train
 
 log = logging.getLogger("hnerf.benchmark")
@@ -96,6 +96,15 @@ def describe_variant(variant: Variant, recorded: Capture) -> dict[str, Any]:
     return counts | {"methods": {}}
 
 
+def ingest_part(store: Store, source: Source, part: CapturePart, settings: Settings) -> Artifact:
+    """Ingest the recording, or that part of it which a study uses, within the limits of these settings, which then
+    apply to what follows."""
+    set_limits(settings.limits)
+    recording = with_detections(store, ingest(store, source, settings.capture), settings)
+    parts = part.select(Capture.load(recording.root))
+    return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
+
+
 def measure(
     store: Store, source: Source, truth: Source, variant: Variant, plan: BenchmarkStudy, method: str
 ) -> dict[str, Any]:
@@ -103,11 +112,7 @@ def measure(
     fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
-        set_limits(settings.limits)
-        recording = with_detections(store, ingest(store, source, settings.capture), settings)
-        parts = variant.select(Capture.load(recording.root))
-        if parts != (None, None, None):
-            recording = subset_capture(store, recording, *parts)
+        recording = ingest_part(store, source, variant, settings)
         prepared = prepare_training(store, recording, settings)
         if plan.until_flat:
             settings, more = train_until_flat(store, truth, prepared, plan, method)

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from prefect import flow
 
+from flows.benchmark import ingest_part
 from flows.run_page import publish_markdown, shown_progress
-from flows.train_subject import Prepared, prepare_training, with_detections
+from flows.train_subject import Prepared, prepare_training
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
@@ -25,10 +26,8 @@ from hnerf.study.stability.charts import curve_chart, matrix_chart
 from hnerf.study.stability.plan import StabilityStudy, load_stability
 from hnerf.study.stability.report import REFERENCE, as_markdown
 from hnerf.study.stability.verdict import BROKEN, RunVerdict, judge, near_border
-from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate
 from tasks.fit import fit
-from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
@@ -77,7 +76,7 @@ def stability(
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    subject = Capture.load(ingest_part(artifact_store, source, plan, next(iter(presets.values()))).root).name
+    subject = Capture.load(ingest_part(artifact_store, source, plan.part, next(iter(presets.values()))).root).name
     table = artifact_store.root / "stability" / f"{subject}-{Path(study).stem}{'' if plan == whole else '-part'}.md"
     artifact_store.claim_table(table, source.digest, source.root)
     result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
@@ -108,7 +107,7 @@ def _runs(
     why}."""
     tried = [(kind, strength) for kind, strengths in plan.degradations.items() for strength in strengths]
     for method, preset in presets.items():
-        recording = ingest_part(store, source, plan, preset)
+        recording = ingest_part(store, source, plan.part, preset)
         near = set()
         for seed in plan.seeds:
             for run in _runs_of_seed(method, Attempt.of_seed(store, recording, truth, preset, seed), tried):
@@ -135,15 +134,6 @@ def _runs_of_seed(method: str, as_recorded: "Attempt", tried: Sequence[tuple[str
             yield {"left_out": f"{KINDS[kind].label}, {strength:g}: {found['left_out']}"}
             continue
         yield row | {"kind": kind, "strength": strength} | verdict_row(found, good)
-
-
-def ingest_part(store: Store, source: Source, plan: StabilityStudy, settings: Settings) -> Artifact:
-    """Ingest the recording, or that part of it which the study uses, within the limits of these settings, which then
-    apply to what follows."""
-    set_limits(settings.limits)
-    recording = with_detections(store, ingest(store, source, settings.capture), settings)
-    parts = plan.part.select(Capture.load(recording.root))
-    return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
 
 
 def verdict_row(found: Figures, good: Figures) -> Figures:
