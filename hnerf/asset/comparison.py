@@ -152,9 +152,8 @@ def _compared(
     photograph = capture.image(view.camera, view.frame)[box] * mask[box][..., None]
     photograph = cv2.resize(photograph, small.size_px, interpolation=cv2.INTER_AREA)
     shown = cv2.resize(255 * mask[box].astype(np.uint8), small.size_px, interpolation=cv2.INTER_AREA) > 127
-    k = avatar.body.index(view.frame)
     with torch.no_grad():
-        field = rgba(avatar.render(small, avatar.body.theta[k], avatar.body.root[k]))
+        field = rgba(avatar.render(small, *avatar.body.pose(view.frame)))
     gain = avatar.gains.get(view.camera, (1.0, 1.0, 1.0))
     renders = {"field": field} | looks_on_black(surface, staged, cast, small.size_px, gain)
     if splats:

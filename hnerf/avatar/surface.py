@@ -26,8 +26,7 @@ TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 
 def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
     """Extract the surface of the avatar in a frame's pose, in world metres (single precision)."""
-    k = avatar.body.index(frame)
-    mesh = surface_in_pose(avatar, avatar.body.theta[k], avatar.body.root[k], POSED_CELLS)
+    mesh = surface_in_pose(avatar, *avatar.body.pose(frame), POSED_CELLS)
     return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=False)
 
 

@@ -24,6 +24,11 @@ class BodyFit:
         """Return the row of a capture's frame."""
         return self.frames.index(frame)
 
+    def pose(self, frame: int) -> tuple[Tensor, Tensor]:
+        """Return theta (J, 3) and root (4, 4) in a capture's frame."""
+        row = self.index(frame)
+        return self.theta[row], self.root[row]
+
     def to(self, device: torch.device | str) -> "BodyFit":
         """Return the same fit on another device."""
         return BodyFit(self.rig.to(device), self.frames, self.theta.to(device), self.root.to(device))

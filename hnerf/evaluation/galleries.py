@@ -109,8 +109,7 @@ def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None
 
 def _body_mesh(body: BodyFit, frame: int) -> trimesh.Trimesh:
     """Return the unclothed body in the pose of a frame."""
-    k = body.index(frame)
-    vertices_m = pose_vertices(body.rig, body.theta[k], body.root[k])
+    vertices_m = pose_vertices(body.rig, *body.pose(frame))
     return trimesh.Trimesh(vertices_m.numpy(), body.rig.faces.numpy(), process=False)
 
 

@@ -42,10 +42,9 @@ def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], o
     black and coverage. Return the wall-clock seconds per image; on a CPU, several are rendered at a time."""
 
     def write(view: View) -> None:
-        body = avatars[view.split].body
-        k = body.index(view.frame)
+        avatar = avatars[view.split]
         with torch.no_grad():
-            pixels = rgba(avatars[view.split].render(capture.cameras[view.camera], body.theta[k], body.root[k]))
+            pixels = rgba(avatar.render(capture.cameras[view.camera], *avatar.body.pose(view.frame)))
         write_image(view.path(out), pixels)
 
     started = time.perf_counter()

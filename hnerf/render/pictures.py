@@ -110,10 +110,9 @@ def normal_image(avatar: Avatar, rendering: Rendering, camera: Camera, theta: Te
 def _render_kinds(avatar: Avatar, shot: Shot, what: Sequence[str]) -> dict[str, np.ndarray]:
     """Render a shot once and return the requested kinds that are images, greyscale or RGB."""
     camera, frame = shot
-    row = avatar.body.index(frame)
-    theta, root = avatar.body.theta[row], avatar.body.root[row]
     if set(what) <= {"mesh"}:
         return {}
+    theta, root = avatar.body.pose(frame)
     seen = avatar.render(camera, theta, root)
     kinds: dict[str, Callable[[], Tensor]] = {
         "colour": lambda: (255 * seen.rgb).round().to(torch.uint8),

@@ -164,11 +164,11 @@ def add_training_distances(scene: ScoringScene, split: str, found: SplitScores) 
 def frame_seconds(avatar: Avatar, camera: Camera, frame: int, side_px: int) -> float:
     """Return the median seconds of rendering a fitted pose to an image with this longest side."""
     resized = camera.scaled(side_px / max(camera.size_px))
-    k = avatar.body.index(frame)
+    pose = avatar.body.pose(frame)
     seconds: list[float] = []
     while not seconds or (len(seconds) < REPEATS and seconds[0] < SLOW_S):
         started = time.perf_counter()
         with torch.no_grad():
-            avatar.render(resized, avatar.body.theta[k], avatar.body.root[k]).rgb.cpu()
+            avatar.render(resized, *pose).rgb.cpu()
         seconds.append(time.perf_counter() - started)
     return float(np.median(seconds))
