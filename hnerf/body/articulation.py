@@ -1,9 +1,9 @@
-"""Points carried by the joints that turn, with their analytic Jacobian.
+"""Points carried by the moving joints, with their analytic Jacobian.
 
 Locked joints follow their nearest free ancestor rigidly, so a rig of a hundred joints reduces to about twenty that
-move. Locked joints that have a turn nevertheless, those of fingers, keep it. A point's world position is linear in the
-moving joints' transforms and in the shape: x = sum_m R_m (a_m - w_m q_m) + w_m p_m with rest joint q_m, posed joint
-p_m, and a_m the point's rest position times its weight w_m on joint m.
+move. Locked joints that are turned nevertheless (those of fingers) keep their turn. A point's world position is linear
+in the moving joints' transforms and in the shape: x = sum_m R_m (a_m - w_m q_m) + w_m p_m with rest joint q_m, posed
+joint p_m, and a_m the point's rest position times its weight w_m on joint m.
 
 The unknowns of a frame, in this order: the root joint's displacement (3) in metres, a rotation about it (3) in world
 axes, then the change of axis-angle (3) of every other moving joint.
@@ -24,7 +24,7 @@ class Pose:
 
     rig: linearised at the shape, its `beta` (B,); theta (n, J, 3) radians, zero at the root; root (n, 4, 4) world from
     body, metres; offsets_m (25, 3): where the detector sees each keypoint on the rest body, minus where the body model
-    has it.
+    places it.
     """
 
     rig: Rig
@@ -56,8 +56,8 @@ class PosedJoints:
 
 @dataclass(frozen=True)
 class PosedSkin(PosedJoints):
-    """Moving joints, and what they leave out of the skin. bent_m (n, K, 3): what turns of locked joints add to the
-    vertices `bent` (K,), by way of the moving joints `bent_by` (K,)."""
+    """Moving joints, and the part of the skin's position that they do not explain. bent_m (n, K, 3): displacement that
+    turns of locked joints add to the vertices `bent` (K,), which the moving joints `bent_by` (K,) carry."""
 
     bent: Tensor
     bent_by: Tensor
@@ -66,12 +66,13 @@ class PosedSkin(PosedJoints):
 
 @dataclass(frozen=True)
 class FixedParts:
-    """What of an articulation no change of shape touches.
+    """The parts of an articulation that do not depend on the shape.
 
-    joints (M,) of the rig that move; parents (M,) and carrier (J,): the moving joint above each of these, and the one
-    that each of the rig's joints follows. subtree (M, M): 1 at [j, m] if turning j moves m. vertex_weights (V, M).
-    keypoint_vertices (V,) bool: the U vertices of which keypoints are sums; keypoint_carried (25, M) bool: the N pairs
-    of a keypoint and a moving joint that carries part of it; keypoint_split (N, U): what each vertex gives to these.
+    joints (M,): the rig's moving joints; parents (M,): the moving joint above each of them; carrier (J,): the moving
+    joint that each of the rig's joints follows. subtree (M, M): 1 at [j, m] if turning j moves m. vertex_weights (V,
+    M). keypoint_vertices (V,) bool: the U vertices that keypoints are sums of; keypoint_carried (25, M) bool: the N
+    pairs of a keypoint and a moving joint that carries part of it; keypoint_split (N, U): each vertex's contribution to
+    each pair.
     """
 
     joints: Tensor
@@ -130,8 +131,8 @@ class Articulation:
         return PosedSkin(**vars(joints), bent=bent, bent_by=bent_by, bent_m=bent_m)
 
     def _bent_vertices(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the vertices (K,) on locked joints that have a turn in some frame, or on joints below them, and the
-        moving joints that carry these (K,)."""
+        """Return the vertices (K,) on locked joints that are turned in some frame, or on joints below these, and the
+        moving joints (K,) that carry the vertices."""
         turned = (theta != 0).any(-1).any(0)
         turned[self.joints] = False
         for j, parent in enumerate(self.rig.parents.tolist()):
@@ -142,8 +143,8 @@ class Articulation:
         return bent, self.carrier[self.rig.skin_joints[bent, slot]]
 
     def _rigid(self, ids: Tensor | slice, rotations: Tensor, positions_m: Tensor) -> Tensor:
-        """Return vertices `ids` (K,) as the moving joints carry them, (..., K, 3) world: rotations (..., M, 3, 3) and
-        positions_m (..., M, 3) of these."""
+        """Return vertices `ids` (K,) as the moving joints carry them, (..., K, 3) world. rotations (..., M, 3, 3),
+        positions_m (..., M, 3): of the moving joints."""
         moved = positions_m - (rotations @ self.rest_m[..., None])[..., 0]
         blended = self.vertex_weights[ids] @ torch.cat([rotations.flatten(-2), moved], -1)
         return (blended[..., :9].unflatten(-1, (3, 3)) @ self.rig.vertices_m[ids, :, None])[..., 0] + blended[..., 9:]
@@ -155,8 +156,8 @@ class Articulation:
         return surface
 
     def jacobian(self, points: Points, joints: PosedJoints) -> tuple[Tensor, Tensor, Tensor]:
-        """Return positions (n, P, 3), and their derivatives by the frame's unknowns (n, P, 3, U) and by beta (n, P, 3,
-        B)."""
+        """Return positions (n, P, 3), and their derivatives with respect to the frame's unknowns (n, P, 3, U) and beta
+        (n, P, 3, B)."""
         carried = self._weighted_positions(points, joints)
         moved = torch.einsum("jm,npmd->npjd", self.subtree, carried)
         lever = moved - torch.einsum("jm,pm->pj", self.subtree, points.weights)[..., None] * joints.positions_m[:, None]
@@ -173,8 +174,8 @@ class Articulation:
     def directional_jacobian(
         self, ids: Tensor, directions: Tensor, skin: PosedSkin, frame: int
     ) -> tuple[Tensor, Tensor]:
-        """Return derivatives of the positions of vertices `ids` (P,) along directions (P, 3): by the frame's unknowns
-        (P, U), and by beta (P, B). Equal to `jacobian` times the directions, without forming it."""
+        """Return derivatives of the positions of vertices `ids` (P,) along directions (P, 3), with respect to the
+        frame's unknowns (P, U) and beta (P, B). Equal to `jacobian` times the directions, without forming it."""
         weights, rest = self.vertex_weights[ids], self.rig.vertices_m[ids, None] - self.rest_m
         rotations, positions = skin.rotations[frame], skin.positions_m[frame]
         carried = weights[..., None] * (torch.einsum("mcd,pmd->pmc", rotations, rest) + positions)
@@ -207,7 +208,7 @@ class Articulation:
         return replace(pose, theta=theta, root=root)
 
 
-@functools.lru_cache(maxsize=4)  # by identity: the rigs of one body share these tensors at every shape
+@functools.lru_cache(maxsize=4)  # keyed by tensor identity: the rigs of one body share these tensors at every shape
 def _fixed_parts(
     parents: Tensor, free: Tensor, skin_joints: Tensor, skin_weights: Tensor, keypoint_weights: Tensor
 ) -> FixedParts:
@@ -225,7 +226,7 @@ def _fixed_parts(
     weights = torch.zeros(len(skin_weights), len(joints), dtype=skin_weights.dtype)
     weights.scatter_add_(1, carrier[skin_joints], skin_weights)
     used = (keypoint_weights != 0).any(0)
-    carried = (keypoint_weights != 0).float() @ (weights != 0).float() > 0  # few of them
+    carried = (keypoint_weights != 0).float() @ (weights != 0).float() > 0  # true for few pairs
     keypoint, joint = carried.nonzero(as_tuple=True)
     split = keypoint_weights[keypoint][:, used] * weights[used].T.contiguous()[joint]
     return FixedParts(joints, above, carrier, subtree, weights, used, carried, split)

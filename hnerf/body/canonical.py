@@ -23,15 +23,15 @@ from hnerf.body.rig import (
     vertex_transforms,
 )
 
-ON_EDGE = 1e-5  # barycentric weights below it count as zero
-FAR_M = 10.0  # a reach beyond any point that is queried
+ON_EDGE = 1e-5  # barycentric weights below this count as zero
+FAR_M = 10.0  # a reach that includes every point that is queried
 
 
 @dataclass(frozen=True)
 class Descriptor:
-    """What the body prior says of N points: d (N,) metres, negative inside; s (N, 3) on the rest body; y (N, 3)
-    canonical position; near (N,) bool: within reach (the rest is meaningless where it is False); corners (N, 3):
-    vertices of the closest triangle; barycentric (N, 3) of the closest point in it."""
+    """What the body prior gives for N points: d (N,) metres, negative inside; s (N, 3) on the rest body; y (N, 3)
+    canonical position; near (N,) bool: within reach (where False, all else is meaningless); corners (N, 3): vertices of
+    the closest triangle; barycentric (N, 3) of the closest point in it."""
 
     d: Tensor
     s: Tensor
@@ -58,10 +58,10 @@ class PoseCorrection(nn.Module):
     """Small changes of pose and shape, learned while the body meshes stay fixed (Delta theta_t, Delta beta of the
     paper).
 
-    Each frame has small twists in world axes of the free joints and the root, (n, free + 1, 3), and a displacement of
-    the root, (n, 3); the shape changes for all frames, (B,). A twist moves a point by its joint's share of the point's
-    skin weights: the linearisation of skinning for one bone, blended between bones. `PosedBodies.absorb` turns the
-    correction into theta, T and beta.
+    Each frame has small twists of the free joints and the root, in world axes, (n, free + 1, 3), and a displacement of
+    the root, (n, 3); one change of shape, (B,), applies to all frames. A twist moves a point in proportion to its skin
+    weight on the joint and the joint's descendants: skinning linearised for one bone, blended between bones.
+    `PosedBodies.absorb` turns the correction into theta, T and beta.
     """
 
     absorbed_turn: Tensor
@@ -77,12 +77,12 @@ class PoseCorrection(nn.Module):
             self.register_buffer(f"absorbed_{name}", torch.zeros_like(parameter.data))
 
     def totals(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (turn, move_m, shape) since the fit, including what was absorbed."""
+        """Return the total (turn, move_m, shape) since the fit, including what was absorbed."""
         return (self.turn + self.absorbed_turn, self.move_m + self.absorbed_move_m, self.shape + self.absorbed_shape)
 
 
 class PosedBodies:
-    """The body in several poses: closest points, descriptors, and their derivatives by pose and shape."""
+    """The body in several poses: closest points, descriptors, and their derivatives with respect to pose and shape."""
 
     def __init__(self, rig: Rig, theta: Tensor, root: Tensor, canonical_m: Tensor):
         """Pose the rig: theta (n, J, 3), root (n, 4, 4). canonical_m (V, 3): the rest body that s and y refer to,
@@ -118,8 +118,8 @@ class PosedBodies:
         self._joint_shape = self._joint_shape_motion()
 
     def _joint_shape_motion(self) -> Tensor:
-        """Return how a unit of each shape moves what each joint carries rigidly, (n J, 3 B) metres: the joint's
-        displacement in the world minus its rotated displacement in the rest body."""
+        """Return how a unit of each shape value moves the points that each joint carries rigidly, (n J, 3 B) metres:
+        the joint's displacement in the world minus its rotated displacement in the rest body."""
         turned = self._joints[..., :3, :3] @ self.rig.joint_basis.permute(1, 2, 0)
         return (posed_joint_basis(self.rig, self._joints, self.root) - turned).flatten(2).flatten(0, 1)
 
@@ -138,10 +138,10 @@ class PosedBodies:
         beside_m: Tensor | None = None,
     ) -> Descriptor:
         """Return descriptors of world points (N, 3) relative to the bodies of rows `frame` (N,); gradients flow to the
-        points and the correction, through s only if it `s_follows`.
+        points and the correction; through s, only if `s_follows`.
 
-        beside_m (M, N, 3): return instead those of the points moved by M offsets each, (M N,), to first order: what is
-        closest is looked for once.
+        beside_m (M, N, 3): return instead the descriptors of the points moved by M offsets each, (M N,), to first
+        order, with one search for the closest points.
         """
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
         return self._described(points_m, frame, found, correction, s_follows, beside_m)
@@ -155,8 +155,8 @@ class PosedBodies:
         exact_sign: bool = False,
         beside_m: Tensor | None = None,
     ) -> tuple[Descriptor, Tensor]:
-        """Return what `describe` does, followed by descriptors relative to limbs beside the closest, where the pose
-        brings them close to it; and of which of the points these M are, (M,). Their s does not follow the points."""
+        """Return what `describe` returns, followed by M descriptors relative to limbs other than the closest one, where
+        the pose brings them close to it; and the points that these M belong to, (M,). No s follows the points."""
         closest = self.describe(points_m, frame, reach_m, correction, exact_sign, False, beside_m)
         if not self._limb_meshes:
             return closest, torch.zeros(0, dtype=torch.long, device=frame.device)
@@ -170,8 +170,9 @@ class PosedBodies:
     def _closest_on_limbs(
         self, points_m: Tensor, frame: Tensor, reach_m: float, asked: Tensor
     ) -> tuple[Tensor, ClosestPoints]:
-        """Return which points are within reach of a limb that they ask for, (M,), and what of it is closest to them.
-        asked (N, L) bool. Limbs end where they join: that end is no surface."""
+        """Return which points are within reach of a limb that is queried for them, (M,), and their closest points on
+        it. asked (N, L) bool: the limbs to query. Closest points on the cut where a limb joins the body are dropped: it
+        is no surface."""
         found = []
         for limb, meshes in self._limb_meshes.items():
             points = torch.nonzero(asked[:, limb])[:, 0]
@@ -192,7 +193,7 @@ class PosedBodies:
         s_follows: bool,
         beside_m: Tensor | None,
     ) -> Descriptor:
-        """Return the descriptors of points by their closest points; the arguments are those of `describe`."""
+        """Return the descriptors of points from their closest points; the arguments are those of `describe`."""
         moved = points_m - points_m.detach()  # zero, but carries the gradient
         if beside_m is not None:
             many = len(beside_m)
@@ -209,22 +210,22 @@ class PosedBodies:
         if correction is not None:
             nearest = nearest_corner(corners, found.barycentric)
             moved = moved - self._displacement(points_m.detach(), frame, nearest, correction)
-        y = s + (inverse * (offset + moved)[:, None]).sum(-1)  # many small products of matrices are slower
+        y = s + (inverse * (offset + moved)[:, None]).sum(-1)  # faster than many small matrix products
         if s_follows and moved.requires_grad:  # only gradients need it
             s = s + (inverse * self._closest_point_motion(posed, found.barycentric, normal, moved)[:, None]).sum(-1)
         d = found.sign * distance + (normal * moved).sum(-1)
         return Descriptor(d, s, y, found.face >= 0, corners, found.barycentric)
 
     def turn(self, directions: Tensor, frame: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
-        """Return canonical directions (N, 3) as the skinning of rows `frame` (N,) carries them into the world at points
-        in triangles; corners, barycentric (N, 3): as in Descriptor."""
+        """Return canonical directions (N, 3) turned into the world by the skinning of rows `frame` (N,), at points in
+        triangles; corners, barycentric (N, 3): as in Descriptor."""
         posed = frame.long()[:, None] * len(self.rig.vertices_m) + corners
         linear = weighted_sum(self._linear.flatten(0, 1).flatten(1), posed, barycentric).unflatten(-1, (3, 3))
         return (linear * directions[:, None]).sum(-1)
 
     def _closest_point_motion(self, posed: Tensor, barycentric: Tensor, normal: Tensor, moved: Tensor) -> Tensor:
-        """Return how the closest point follows when its point moves by `moved` (N, 3): along the face it lies on, along
-        the edge if it lies on one, not at all if it is a vertex. posed (N, 3): rows of the posed vertices."""
+        """Return how the closest point follows when the queried point moves by `moved` (N, 3): along the face it lies
+        on, along the edge if it lies on one, not at all if it is a vertex. posed (N, 3): rows of the posed vertices."""
         on_face = moved - normal * (normal * moved).sum(-1, keepdim=True)
         away = barycentric < ON_EDGE
         cornered = torch.nonzero(away.any(1))[:, 0]
@@ -266,7 +267,7 @@ class PosedBodies:
         if same_posture is not None:
             theta[same_posture] = theta[same_posture].mean(0)
             own = above @ rotation_from_axis_angle(theta[:, free]) @ (above @ rotations[:, free]).transpose(-1, -2)
-            correction.turn[same_posture, :-1] = axis_angle_from_rotation(own)[same_posture]  # by how much they turned
+            correction.turn[same_posture, :-1] = axis_angle_from_rotation(own)[same_posture]  # the turn that they got
         turn, pivot = rotation_from_axis_angle(correction.turn[:, -1]), self._joints[:, 0, :3, 3]
         root[:, :3, :3] = turn @ root[:, :3, :3]
         root[:, :3, 3] = (turn @ (root[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + correction.move_m
@@ -277,7 +278,7 @@ class PosedBodies:
 
 
 def nearest_corner(corners: Tensor, barycentric: Tensor) -> Tensor:
-    """Return the one of corners (N, 3) whose barycentric weight is greatest, (N,)."""
+    """Return which of the corners (N, 3) has the greatest barycentric weight, (N,)."""
     return corners.gather(1, barycentric.argmax(1, keepdim=True))[:, 0]
 
 
@@ -288,7 +289,7 @@ def weighted_sum(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor
 
 
 class _WeightedSum(torch.autograd.Function):
-    """`embedding_bag` with a gradient of its own: the built-in one sorts the corners and takes four times as long on a
+    """`embedding_bag` with its own gradient: the built-in one sorts the corners and takes four times as long on a
     CPU."""
 
     @staticmethod
@@ -306,7 +307,7 @@ class _WeightedSum(torch.autograd.Function):
 
 
 def distinct_rows(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return which of `count` rows occur among `rows` (N,), and the position of each of `rows` among them, (N,);
+    """Return which of `count` rows occur among `rows` (N,), and the position of each of `rows` among those, (N,);
     without sorting."""
     occurs = torch.zeros(count, dtype=torch.bool, device=rows.device)
     occurs[rows] = True

@@ -1,8 +1,9 @@
-"""Fit of the outlines by a clothed body: how far cloth and hair stand away from each vertex, the same in all frames.
+"""Fit of a clothed body to the outlines: cloth and hair stand away from each vertex by an offset, the same in all
+frames.
 
 A naked body never fits its masks: each frame's pose drifts towards what sleeves and hair add, in a different way in
-every pose. What the outlines of all frames have in common is therefore estimated beside the poses, as offsets along the
-vertex normals; the residuals that are left pull the body in both directions.
+every pose. What the outlines of all frames have in common is therefore estimated along with the poses, as offsets along
+the vertex normals; the remaining residuals pull the body in both directions.
 """
 
 import logging
@@ -26,19 +27,19 @@ from hnerf.side_by_side import side_by_side
 log = logging.getLogger("hnerf.fit")
 
 CLOTHED_STEPS = 6
-MIN_FRAMES = 8  # with fewer, errors of a pose look like clothes
+MIN_FRAMES = 8  # with fewer, pose errors look like clothes
 MIN_NORMAL_COSINE = 0.7  # between the outlines' normals where points may match
 MAX_MATCH_M = 0.04  # between matched points
-EDGE_STD_M, OUTLIER_M = 0.006, 0.02  # of a mask's edge about the clothed body, and its outliers
-SMOOTHNESS_WEIGHT, SKIN_WEIGHT = 2.0, 0.02  # in matches: of equal offsets at neighbours, and of no offset
+EDGE_STD_M, OUTLIER_M = 0.006, 0.02  # standard deviation of a mask's edge about the clothed body, and outliers
+SMOOTHNESS_WEIGHT, SKIN_WEIGHT = 2.0, 0.02  # in matches: for equal offsets at neighbours, and for a zero offset
 
 
 def refine_with_clothing(problem: Problem, pose: Pose, edges: list[list[Outline | None]], threads: int) -> Pose:
     """Refine a pose by Gauss-Newton steps on outlines and keypoints of a clothed body.
 
-    Before each step matches are made anew and the cloth offsets solved for. edges: by frame and camera, None without a
-    mask; threads: for frames side by side. The pose is returned unchanged with one camera, which hardly distinguishes
-    clothes from a body that is nearer, and with few frames.
+    Each step first renews the matches and solves for the cloth offsets. edges: by frame and camera, None without a
+    mask; threads: number of frames to process in parallel. The pose is returned unchanged with one camera, which hardly
+    distinguishes clothes from a body that is nearer, and with few frames.
     """
     if len(problem.observations.cameras) == 1 or sum(any(row) for row in edges) < MIN_FRAMES:
         return pose
@@ -53,7 +54,7 @@ def _clothed_step(
     problem: Problem, pose: Pose, edges: list[list[Outline | None]], before_m: np.ndarray, threads: int
 ) -> tuple[Pose, np.ndarray, float]:
     """Return the pose after one step, the cloth offsets (V,) metres, and the residuals before the step (root mean
-    square, mm). before_m: the offsets of the step before."""
+    square, mm). before_m: the offsets of the previous step."""
     faces = pose.rig.faces.numpy()
     articulation = Articulation(pose.rig)
     skin = articulation.skin(pose)
@@ -80,7 +81,7 @@ def match_clothed(
 ) -> ContourResiduals:
     """Match every point of a mask's contour to the nearest rim vertex of the clothed body.
 
-    Residuals are negative where the body is too small; weights fall from 1 (Geman-McClure). scale_m: metres a pixel
+    Residuals are negative where the body is too small; weights fall off from 1 (Geman-McClure). scale_m: metres a pixel
     spans; vertices_m and normals (V, 3).
     """
     rim, uv, by_x, normals_2d = rim_in_image(camera, vertices_m, normals, faces)
@@ -97,8 +98,8 @@ def match_clothed(
 
 
 def solve_cloth_offset(cloth_offset_m: np.ndarray, found: list[ContourResiduals], faces: np.ndarray) -> np.ndarray:
-    """Return the distance of the clothes from each vertex, (V,) metres, from the previous one and the residuals of
-    matches made with it: least squares, smooth over the body, and nearly zero where nothing is seen."""
+    """Return the distance of the clothes from each vertex, (V,) metres, given the previous distance and the residuals
+    of matches made with it: least squares, smooth over the body, and nearly zero where nothing is seen."""
     ids, residual_m, weight = (
         np.concatenate([getattr(rows, name) for rows in found]) for name in ("vertices", "residual_m", "weight")
     )

@@ -1,7 +1,7 @@
-"""The mean change of the poses moved into the rest body.
+"""Move the mean change of all poses into the rest body.
 
-What training changes alike in the poses of all frames is a property of the body; in its rest pose it also shows in
-poses that no frame has.
+A change that training makes alike to the poses of all frames is a property of the body. Once in the rest pose, it also
+takes effect in poses that no frame has.
 """
 
 import dataclasses
@@ -16,13 +16,13 @@ from hnerf.body.rig import Rig, joint_transforms, pose_vertices, rotation_from_a
 def with_common_rest(
     rig: Rig, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]
 ) -> tuple[Rig, Tensor, Tensor]:
-    """Return a rig whose rest pose includes the mean change of all poses, and the poses that then reproduce `after`;
-    with it, poses `before` show the body turned and moved by that mean change, exactly if only one joint of a chain
-    turns: a change of a joint and turns of those below it do not commute.
+    """Return a rig whose rest pose includes the mean change of all poses, and the poses that reproduce `after` with
+    this rig. In the poses `before`, this rig shows the body turned and moved by that mean change; exactly so only if a
+    single joint of a chain turns, since a joint's change does not commute with turns of the joints below it.
 
     before, after: theta (n, J, 3) and root (n, 4, 4). Joints, and points that are rigid on one, stay where they were in
-    `after`; points blended between joints differ by the square of the mean turn. The shape basis, which would turn
-    likewise, is kept.
+    `after`; points blended between joints differ by the square of the mean turn. The shape basis should turn likewise,
+    but is kept.
     """
     theta, root = _mean_change(before, after)
     resting = joint_transforms(rig, theta, root)

@@ -31,21 +31,21 @@ log = logging.getLogger("hnerf.fit")
 
 MASK_BLUR_PX = 0.7  # smooths the pixel steps of a mask's edge
 MAX_RIM_COSINE = 0.35  # |cosine| between normal and view below which a vertex is on the rim
-RIM_DEPTH_PX = 2.5  # of rim vertices from the border of the body's silhouette
+RIM_DEPTH_PX = 2.5  # greatest depth of rim vertices inside the body's silhouette
 MIN_NORMAL_COSINE = 0.5  # between the outlines' normals above which points may match
-GROUND_STD_M = 0.01  # of the lowest vertex of a frame above the ground
-GROUND_OUTLIER_M = 0.15  # distance of a body that does not stand on the ground
+GROUND_STD_M = 0.01  # of the height of a frame's lowest vertex above the ground
+GROUND_OUTLIER_M = 0.15  # height of a body that does not stand on the ground
 MAX_SOLE_M = 0.05  # between the skin and the ground
-BORDER_PX = 2.0  # of the picture, at which a mask ends whatever is there
-UNDERSIDE_M = 0.015  # of vertices above the lowest one that may touch the ground
+BORDER_PX = 2.0  # margin at the image border, where every mask ends
+UNDERSIDE_M = 0.015  # height above the lowest vertex up to which others may touch the ground
 HUBER = 1.345  # standard deviations beyond which residuals push no harder; 95 % efficient on Gaussian noise
 DAMPING = 1e-4  # more would hold back depth and scale, which one camera's outlines hardly determine
 
 
 @dataclass(frozen=True)
 class Outline:
-    """The edge of a mask: points (N, 2) px, outward normals (N, 2); size_px of the mask; its signed distance, negative
-    inside, at each stride-th row and column."""
+    """The edge of a mask: points (N, 2) px, outward normals (N, 2); size_px of the mask; the signed distance to it,
+    negative inside, at each stride-th row and column."""
 
     points_px: np.ndarray
     normals: np.ndarray
@@ -54,7 +54,7 @@ class Outline:
     stride: int = 1
 
     def distance_at(self, points_px: np.ndarray) -> np.ndarray:
-        """Return the signed distance (N,) px of points (N, 2); beyond the picture, that of its nearest pixel."""
+        """Return the signed distance (N,) px of points (N, 2); outside the image, that of the nearest pixel."""
         distance_px: np.ndarray = map_coordinates(
             self.distance_px, points_px.T[::-1] / self.stride, order=1, mode="nearest"
         )
@@ -109,8 +109,8 @@ def match(
 def rim_in_image(
     camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the vertices (N,) on the body's outline, their pixels (N, 2), the derivative of these by the vertices (N,
-    2, 3) px per metre, and the unit normals in the image (N, 2)."""
+    """Return the vertices (N,) on the body's outline, their pixels (N, 2), the derivatives of the pixels with respect
+    to the vertices (N, 2, 3) px per metre, and the unit normals in the image (N, 2)."""
     rim = _rim(camera, vertices_m, normals, faces)
     uv, by_x = (t.numpy() for t in project(camera, torch.from_numpy(vertices_m[rim])))
     normals_2d = normals[rim] @ camera.R[:2].T
@@ -142,7 +142,7 @@ def _cover(edge: Outline, rim_px: np.ndarray, rim_normals: np.ndarray) -> tuple[
 
 
 def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Match rim vertices outside the mask, at most one in a cell, to its edge: index, direction (N, 2), distance px
+    """Match rim vertices outside the mask, at most one per cell, to its edge: index, direction (N, 2), distance px
     (positive)."""
     width, height = edge.size_px
     seen = np.flatnonzero(((rim_px >= 0) & (rim_px <= (width - 1, height - 1))).all(1))
@@ -160,10 +160,10 @@ def refine_with_outlines(
     problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, ground: int | None,
     threads: int,
 ) -> Pose:  # fmt: skip
-    """Refine a pose by Gauss-Newton steps on outlines and keypoints, with matches made anew before each step.
+    """Refine a pose by Gauss-Newton steps on outlines and keypoints, renewing the matches before each step.
 
-    edges: by frame and camera, None without a mask; ground: the world's vertical axis where a single camera sees a
-    person stand on height 0, else None; threads: for frames side by side.
+    edges: by frame and camera, None without a mask; ground: the world's vertical axis if a single camera sees a person
+    standing at height 0, else None; threads: number of frames to process in parallel.
     """
     sole_m = 0.0
     for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
@@ -177,7 +177,7 @@ def _outline_step(
     sole_m: float, threads: int,
 ) -> tuple[Pose, float, float]:  # fmt: skip
     """Return the pose after one step, the median height of the skin above the ground, and the residuals before the step
-    (root mean square, mm). sole_m: that height by the step before."""
+    (root mean square, mm). sole_m: that height from the previous step."""
     faces, cameras = pose.rig.faces.numpy(), problem.observations.cameras
     articulation = Articulation(pose.rig)
     skin = articulation.skin(pose)
@@ -207,7 +207,7 @@ def _outline_step(
 
 
 def rms_mm(residuals_m: list[np.ndarray]) -> float:
-    """Return the root mean square of residuals in metres, in millimetres."""
+    """Return the root mean square, in millimetres, of residuals in metres."""
     return 1e3 * float(np.sqrt((np.concatenate(residuals_m) ** 2).mean()))
 
 
@@ -224,8 +224,8 @@ def _ground_contact(vertices_m: np.ndarray, up: int, sole_m: float) -> ContourRe
 
 
 def _sole_m(camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarray, up: int) -> float | None:
-    """Return how far the mask reaches out below the foot, at the vertex that is lowest in the image of those that may
-    touch the ground: shoes stand between it and the skin. None where the picture ends before the foot does."""
+    """Return the thickness of the sole: how far the mask extends below the skin of the foot, at the vertex that is
+    lowest in the image among those that may touch the ground. None if the image ends before the foot does."""
     height_m = vertices_m[:, up]
     pixels = camera.project(vertices_m[height_m < height_m.min() + UNDERSIDE_M])[0]
     lowest = pixels[(pixels @ -camera.R[:2, up]).argmax()]

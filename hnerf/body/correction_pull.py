@@ -1,4 +1,5 @@
-"""How far a correction of pose and shape carries points, and its gradient, in one pass over them each, by warp."""
+"""How far a correction of pose and shape carries points, and the gradient of that, each in one pass over the points by
+warp."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -14,10 +15,11 @@ from hnerf.warp_import import wp
 class Displacement(torch.autograd.Function):
     """Displacement (N, 3) of points (N, 3), each carried by one vertex of one frame's body.
 
-    posed (N,) int32: row of frame and vertex among n V; twists (n, C, 2, 3): turn and shift of each chain of joints,
-    and share (V, C) of the vertices in them; bulge (V, 3): change of the rest body, which linear (n V, 3, 3) turns;
-    carried (n, J, 3): what joints carry rigidly, shared by skin_joints (V, K) int32 and skin_weights (V, K). Gradients
-    flow to twists, bulge and carried; fixed are points, posed, share, linear, skin_joints and skin_weights.
+    posed (N,) int32: that vertex's row among the n V of all frames; twists (n, C, 2, 3): turn and shift of each chain
+    of joints; share (V, C): weight of each vertex in these chains; bulge (V, 3): change of the rest body, turned by
+    linear (n V, 3, 3); carried (n, J, 3): displacement of what each joint carries rigidly, blended by skin_joints (V,
+    K) int32 and skin_weights (V, K). Gradients flow to twists, bulge and carried. fixed: points, posed, share, linear,
+    skin_joints and skin_weights.
     """
 
     @staticmethod
@@ -53,7 +55,7 @@ def _launch(which: int, learned: tuple[Tensor, ...], fixed: tuple[Tensor, ...], 
 
 @cache
 def _kernels(dtype: torch.dtype) -> tuple[wp.Kernel, wp.Kernel]:
-    """Return the kernels of displacements, and of their gradients, which are added to `twists`, `bulge`, `carried`."""
+    """Return the kernels for displacements and for their gradients, which are added to `twists`, `bulge`, `carried`."""
     scalar = wp.dtype_from_torch(dtype)
     Vector, Matrix = wp.types.vector(length=3, dtype=scalar), wp.types.matrix(shape=(3, 3), dtype=scalar)
 

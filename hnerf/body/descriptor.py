@@ -1,8 +1,8 @@
 """The body prior H: (x, theta, T, beta) -> (d, s), computed from posed body meshes.
 
-`BodyMeshes.closest_points` finds the closest point by warp's bounding-volume hierarchy (CPU and CUDA). It takes the
-sign from the winding number only where the surface normal leaves doubt, and, if asked to be exact, next to faces that
-are buried where the body intersects itself.
+`BodyMeshes.closest_points` finds the closest point with warp's bounding-volume hierarchy (CPU and CUDA). It takes the
+sign from the winding number only where the surface normal leaves doubt and, with `exact_sign`, next to faces that are
+buried where the body intersects itself.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from hnerf.warp_import import wp
 
 SURE_COSINE = 0.35  # of the angle between offset and normal; below it the winding number decides the sign
-BESIDE_M = 1e-4  # in front of the surface, where the winding number tells whether it is buried
+BESIDE_M = 1e-4  # distance in front of the surface at which the winding number tells whether it is buried
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ def _closest_kernel(
 
 @wp.kernel
 def _inside_kernel(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), inside: wp.array(dtype=wp.bool)) -> None:
-    """Find out which points, close to the surface of a mesh, are inside."""
+    """Find which points, close to the surface of a mesh, are inside."""
     i = wp.tid()
     inside[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], 2.0 * BESIDE_M).sign < 0.0
 
 
 class BodyMeshes:
-    """Posed copies of one body, one a frame, prepared for closest-point queries."""
+    """Posed copies of one body, one per frame, prepared for closest-point queries."""
 
     def __init__(self, vertices_m: Tensor, faces: Tensor):
         """Build the hierarchies of vertices_m (n, V, 3) with faces (F, 3)."""
@@ -104,9 +104,9 @@ class BodyMeshes:
                 self._coming = self._doubtful = None
 
     def _doubtful_faces(self, points: int) -> Tensor:
-        """Return which faces of each copy are buried where the body intersects itself, or touch one that is, (n, F)
-        bool; all, without looking, for so few points that it would take longer. A face is buried if the inside lies in
-        front of its middle, or in front of a corner."""
+        """Return which faces of each copy are buried where the body intersects itself, or touch a buried one, (n, F)
+        bool. For so few points that the search would cost more than it saves, return all faces. A face is buried if a
+        point just in front of its middle or of a corner is inside the body."""
         if points < len(self._faces):
             return torch.ones(len(self._meshes), len(self._faces), dtype=torch.bool, device=self._faces.device)
         with self._refitting:
@@ -115,7 +115,7 @@ class BodyMeshes:
             return self._doubtful
 
     def _touch_buried(self, copy: int) -> Tensor:
-        """Return these faces of one copy, (F,) bool."""
+        """Return the buried faces of one copy and those that touch them, (F,) bool."""
         mesh, faces, normals = self._meshes[copy], self._faces, self._normals[copy]
         vertices_m = wp.to_torch(mesh.points)
         outwards = nn.functional.normalize(torch.cat([normals, normals[faces].sum(1)]), dim=1)
@@ -129,7 +129,8 @@ class BodyMeshes:
         return touched[faces].any(1)
 
     def _to_warp(self, vertices_m: Tensor) -> list[wp.array]:
-        """Return each copy's vertices for warp, which does not copy them, and compute their normals for the sign."""
+        """Return each copy's vertices as warp arrays, without copying, and compute the vertex normals that decide the
+        sign."""
         vertices_m = vertices_m.detach().float().contiguous()
         self._normals = vertex_normals(vertices_m, self._faces)
         return [wp.from_torch(v, dtype=wp.vec3) for v in vertices_m]
@@ -169,7 +170,7 @@ class BodyMeshes:
 
         if device.type == "cuda":
             find(slice(n))
-        else:  # warp itself uses one thread of a CPU
+        else:  # on a CPU, warp itself uses a single thread
             size = max(1, -(-n // torch.get_num_threads()))
             list(self._threads.map(find, [slice(start, min(start + size, n)) for start in range(0, n, size)]))
         return ClosestPoints(face.long(), barycentric, sign)

