@@ -1,5 +1,5 @@
-"""Fit of the fingers to hand points, with the body held: close to their medians over the frames that show the hand; if
-there are few of these, the others show it relaxed."""
+"""Fit of the fingers to hand points, with the body held fixed. Fingers stay close to their medians over the frames that
+show the hand; if few frames show it, it is relaxed in the others."""
 
 import itertools
 import math
@@ -19,8 +19,8 @@ from hnerf.body.robust import geman_mcclure
 from hnerf.capture.timing import median_step
 
 # By segment, from the palm: flexion of a relaxed hand, and standard deviations of flexion, twist and spread, all in
-# degrees and chosen wide; fingers bend between the limits, from straight, and spread up to theirs, to either side, from
-# rest. Twist is that of a thumb's first joint.
+# degrees and chosen wide. Limits on bending count from straight fingers, limits on spreading, to either side, from
+# rest. Of the joints, only a thumb's first one twists.
 RELAXED_DEG = (20.0, 25.0, 15.0)
 STD_DEG = ((25.0, 2.0, 12.0), (25.0, 2.0, 2.0), (15.0, 2.0, 2.0))
 THUMB_RELAXED_DEG = (5.0, 10.0, 10.0)
@@ -28,16 +28,16 @@ THUMB_STD_DEG = ((15.0, 10.0, 15.0), (15.0, 2.0, 5.0), (20.0, 2.0, 2.0))
 LIMITS_DEG = (-10.0, 100.0)
 SPREAD_LIMITS_DEG, THUMB_SPREAD_LIMITS_DEG = (20.0, 5.0, 5.0), (35.0, 5.0, 5.0)
 RATE_DEG_S = 200.0  # standard deviation of a finger joint's speed: a fist closes in a third of a second
-# Steps, with what counts as an outlier: a fist is a decimetre from a relaxed hand. Then as for the palm. The last steps
-# also hold each joint close to its median over the frames that show the hand.
+# The outlier distance of each step: wide at first, because a fist is a decimetre from a relaxed hand, then as for the
+# palm. The last steps also hold each joint close to its median over the frames that show the hand.
 STEPS_M, MEDIAN_STEPS, DAMPING = (0.2, 0.2, 0.2, 0.2, *12 * (OUTLIER_M,)), 6, 1e-4
-MEDIAN_STD_DEG, MEDIAN_OUTLIER_DEG = 5.0, 20.0  # std about the median, and deviation of another gesture
+MEDIAN_STD_DEG, MEDIAN_OUTLIER_DEG = 5.0, 20.0  # std about the median, and deviation that means another gesture
 MIN_MEDIAN_FRAMES = 3
 
 
 @dataclass(frozen=True)
 class FingerPrior:
-    """Priors on the 30 finger joints. axes (30, 3, 3): rows flexion, twist and spread; mean (30,): of the flexion from
+    """Priors on the 30 finger joints. axes (30, 3, 3): rows flexion, twist and spread; mean (30,): mean flexion from
     rest; low, high and std (30, 3); all in radians."""
 
     axes: Tensor
@@ -48,12 +48,12 @@ class FingerPrior:
 
     @staticmethod
     def of(rig: Rig) -> "FingerPrior":
-        """Return the priors for a rig. Angles count from straight fingers: how far these bend at rest is taken off."""
+        """Return the priors for a rig. Angles count from straight fingers, so the bend at rest is subtracted."""
         axes, bends = [], []
         for side in SIDES:
             at = {name: rig.joints_m[rig.joint_names.index(f"{name}.{side}")] for name in ["wrist", *_names()]}
             normal = torch.linalg.cross(at["finger2-1"] - at["wrist"], at["finger5-1"] - at["wrist"])
-            palmwards = normal if side == "R" else -normal  # where fingers bend to
+            palmwards = normal if side == "R" else -normal  # the direction in which fingers bend
             for finger in range(1, 6):
                 chain = [at[f"finger{finger}-{segment}"] for segment in (1, 2, 3)]
                 bones = [chain[0] - at["wrist"], chain[1] - chain[0], chain[2] - chain[1]]
@@ -88,7 +88,8 @@ def add_persistence(
     equations: NormalEquations, turns: Tensor, following: np.ndarray, std: float, steps: np.ndarray
 ) -> float:
     """Add a Gaussian on the change of turns (n, 30, 3) from one frame to the next, and return its cost. following (F,):
-    rows whose next row is the next frame, `steps` (F,) later; std: of an angle's change in one step, in radians."""
+    rows whose next row is the next frame, `steps` (F,) later; std: standard deviation of an angle's change in one step,
+    in radians."""
     weight = std**-2 * steps[:, None] ** -2.0
     change = (turns[following + 1] - turns[following]).flatten(1).numpy()
     at = np.arange(change.shape[1])
@@ -102,8 +103,8 @@ def add_persistence(
 
 def add_median_prior(equations: NormalEquations, turns: Tensor, shown: Tensor) -> float:
     """Add a robust prior that keeps turns (n, 30, 3) close to their medians over the frames that show their hand, shown
-    (n, 2) bool, and return its cost: a network mistakes small fingers differently in each frame. A hand that few frames
-    show has none."""
+    (n, 2) bool, and return its cost: the network's errors on small fingers change from frame to frame. A hand that few
+    frames show gets no such prior."""
     cost = 0.0
     for hand, seen in enumerate(shown.T):
         if seen.sum() < MIN_MEDIAN_FRAMES:
@@ -119,9 +120,9 @@ def add_median_prior(equations: NormalEquations, turns: Tensor, shown: Tensor) -
 
 
 def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int, ...]], seconds: float) -> Pose:
-    """Return the pose with fingers fitted to hand points (C, n, 42) relative to their palm, everything else held.
+    """Return the pose with fingers fitted to hand points (C, n, 42) relative to their palm, everything else held fixed.
 
-    scale_m (C, n): metres a pixel spans; runs: frames that follow each other; seconds: of their median step.
+    scale_m (C, n): metres a pixel spans; runs: consecutive frames; seconds: duration of their median step.
     """
     rig = pose.rig
     fingers = [rig.joint_names.index(name) for name in finger_joints()]

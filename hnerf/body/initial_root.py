@@ -12,7 +12,7 @@ MIN_WIDTH_M = 0.05  # root mean square distance of points from a line that deter
 
 
 def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the rigid transform (4, 4) that takes points source (N, 3) nearest to target (N, 3) (Kabsch 1976)."""
+    """Return the rigid transform (4, 4) that best aligns points source (N, 3) with target (N, 3) (Kabsch 1976)."""
     centre_s, centre_t = source.mean(0), target.mean(0)
     u, _, vt = np.linalg.svd((target - centre_t).T @ (source - centre_s))
     rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
@@ -22,8 +22,8 @@ def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def root_from_space(rest_m: np.ndarray, points_m: np.ndarray) -> np.ndarray | None:
-    """Return world from body (4, 4) by shoulders and hips or, if one of them is NaN, by the known points of head and
-    torso: rest_m and points_m (25, 3). None where fewer than four points are known, or all of them lie on a line."""
+    """Return world from body (4, 4) from shoulders and hips or, if one of them is NaN, from the known points of head
+    and torso. rest_m and points_m (25, 3). None if fewer than four points are known, or all of them lie on a line."""
     known = np.isfinite(points_m).all(-1)
     chosen = [k for k in (TORSO if known[list(TORSO)].all() else HEAD_AND_TORSO) if known[k]]
     if len(chosen) < 4:
@@ -33,8 +33,8 @@ def root_from_space(rest_m: np.ndarray, points_m: np.ndarray) -> np.ndarray | No
 
 
 def root_from_image(camera: Camera, rest_m: np.ndarray, keypoints: np.ndarray) -> np.ndarray | None:
-    """Return world from body (4, 4) from one view, by head and torso of the rest body: rest_m (25, 3), keypoints (25,
-    3) x_px, y_px, confidence; None with too few keypoints.
+    """Return world from body (4, 4) from one view of head and torso. rest_m (25, 3): the rest body; keypoints (25, 3)
+    x_px, y_px, confidence; None with too few keypoints.
 
     SQPnP (Terzakis and Lourakis 2020), refined by Levenberg-Marquardt; one keypoint is left out if the others
     contradict it.
@@ -53,8 +53,8 @@ def root_from_image(camera: Camera, rest_m: np.ndarray, keypoints: np.ndarray) -
 
 
 def _pnp(camera: Camera, rest_m: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray | None, float]:
-    """Solve for world from body (4, 4), None where there is no solution, and its root mean square distance in px
-    between projected points (N, 3) and pixels (N, 2)."""
+    """Solve for world from body (4, 4), None if there is no solution, and the root mean square distance in px between
+    projected points (N, 3) and pixels (N, 2)."""
     ok, rvec, tvec = cv2.solvePnP(rest_m, pixels, camera.K, None, flags=cv2.SOLVEPNP_SQPNP)
     if not ok:
         return None, np.inf

@@ -22,7 +22,7 @@ from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
 ROOT = np.arange(6)  # the root's unknowns among those of a frame
-ROOT_INFORMATION = 1e-6  # keeps a root where it is if nothing else is known of it
+ROOT_INFORMATION = 1e-6  # keeps a root where it is if nothing else determines it
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Problem:
 
     Shared unknowns: beta (B,), then the keypoint offsets (75,), then the median turns of the posture prior. scale_m (C,
     n): metres a pixel spans at the person, held fixed, since residuals would otherwise shrink as the body comes nearer.
-    balance, ground: with one camera only; posture_prior: None as long as no posture is known; palm: None without hand
-    points; limb_depths: None without metric landmarks of the only camera.
+    balance, ground: used with one camera only; posture_prior: None as long as no posture is known; palm: None without
+    hand points; limb_depths: None unless the only camera has metric landmarks.
     """
 
     observations: Observations
@@ -122,7 +122,7 @@ class Problem:
         )
 
     def apply_step(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:
-        """Return the pose after a damped Gauss-Newton step, its rig linearised anew."""
+        """Return the pose after a damped Gauss-Newton step, with its rig linearised again."""
         beta = pose.rig.beta
         unbounded = torch.full((len(equations.shared) - len(beta),), torch.inf)
         low = torch.cat([self.priors.beta_low - beta, -unbounded]).numpy()
@@ -152,7 +152,7 @@ def levenberg_marquardt(problem: Problem, pose: Pose, data_term: Callable[[Tenso
 
 
 def metres_per_pixel(cameras: tuple[Camera, ...], pose: Pose) -> Tensor:
-    """Return what a pixel spans at the body's root, (C, n) metres."""
+    """Return the length that a pixel spans at the body's root, (C, n) metres."""
     centre = pose.root @ torch.cat([pose.rig.joints_m[0], torch.ones(1, dtype=pose.root.dtype)])
     depth = [centre[:, :3] @ torch.from_numpy(c.R[2]) + float(c.t_m[2]) for c in cameras]
     return torch.stack(

@@ -1,5 +1,5 @@
-"""A prior on how far one end of a limb lies behind the other: one view shows a limb bent towards it and one bent away
-alike, a network's metric landmarks tell them apart."""
+"""A prior on how far one end of a limb lies behind the other: one view hardly distinguishes a limb bent towards it from
+one bent away, but a network's metric landmarks do."""
 
 from dataclasses import dataclass
 
@@ -13,19 +13,19 @@ from hnerf.body.robust import geman_mcclure
 from hnerf.capture.capture import Capture
 from hnerf.detection.merge import nearest_person
 
-# Of a depth between two landmarks against the truth: 45 to 130 mm, bias included, on two rendered recordings.
+# Error of the depth between two landmarks, against the truth: 45 to 130 mm, bias included, on two rendered recordings.
 DEPTH_STD_M, OUTLIER_M = 0.1, 0.3
 
-# BODY_25 keypoints that are one landmark of BlazePose: shoulders, elbows, wrists, hips, knees, ankles.
+# BODY_25 keypoints and the landmark of BlazePose that each of them is: shoulders, elbows, wrists, hips, knees, ankles.
 LANDMARKS = {2: 12, 3: 14, 4: 16, 5: 11, 6: 13, 7: 15, 9: 24, 10: 26, 11: 28, 12: 23, 13: 25, 14: 27}
-# Limbs from the trunk, hips, shoulders. Not the trunk: the network sees it lean back by a decimetre.
+# Limbs from the trunk, hips, shoulders. The trunk is left out: the network sees it lean back by a decimetre.
 LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (9, 10), (10, 11), (12, 13), (13, 14), (9, 12), (2, 5))
 
 
 @dataclass(frozen=True)
 class LimbDepths:
-    """Depths of limbs, of their second end behind the first, as a network saw them: depth_m and trust (n, 10) in the
-    order of LIMBS; away (n, 3): unit directions from the camera to the person."""
+    """Depths of limbs as a network saw them, of the second end behind the first: depth_m and trust (n, 10) in the order
+    of LIMBS; away (n, 3): unit directions from the camera to the person."""
 
     depth_m: Tensor
     trust: Tensor
@@ -50,8 +50,8 @@ class LimbDepths:
 
 
 def observe_limb_depths(capture: Capture, observations: Observations) -> LimbDepths | None:
-    """Return the depths of limbs from the only training camera's landmarks; None where no network looked, or with
-    several cameras, which see depth themselves."""
+    """Return the depths of limbs from the only training camera's landmarks; None if no network was run, or with several
+    cameras, which see depth themselves."""
     found = capture.landmarks(capture.train_cameras[0])
     if found is None or len(capture.train_cameras) > 1:
         return None

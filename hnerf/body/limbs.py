@@ -1,7 +1,7 @@
 """Limbs, and where a pose brings them close to each other.
 
-The closest point of the body does not tell which limb a point near two of them belongs to: where an arm touches a
-trunk in a shirt, the shirt is closer to the bare arm than to the bare trunk. There, each limb is asked for itself.
+The closest point of the body does not tell which limb a point near two of them belongs to: where an arm touches a trunk
+in a shirt, the shirt is closer to the bare arm than to the bare trunk. There, each limb is queried separately.
 """
 
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 FIRST_JOINTS = ("upperarm01.L", "upperarm01.R", "upperleg01.L", "upperleg01.R")  # trunk and head: all above them
 CLOSE_M = 0.06  # from skin to skin; with 10 cm, renderings of valid-walk and valid-wave are the same
-CLOSER_THAN_AT_REST = 0.5  # by this share; limbs are always close where they join
-SAMPLE_CELL_M = 0.04  # one vertex in each of these cells stands for the others
+CLOSER_THAN_AT_REST = 0.5  # share of the distance at rest; limbs are always close where they join
+SAMPLE_CELL_M = 0.04  # one vertex in each of these cells represents the others
 
 
 @dataclass(frozen=True)
 class Limbs:
     """The parts of a body. vertex_limb (V,): 0 for trunk and head, or 1 + the index of the limb's first joint;
-    face_limb (F,); on_cut (V,) bool: vertices where two limbs join; samples (P,): vertices that stand for others,
-    sample_of (V,); rest_m (P, L): distance of a sample at rest from each limb. All three are empty if there is nothing
-    but a trunk."""
+    face_limb (F,); on_cut (V,) bool: vertices where two limbs join; samples (P,): vertices that represent others;
+    sample_of (V,): the sample of each vertex; rest_m (P, L): distance of a sample at rest from each limb. The last
+    three are empty if there is only a trunk."""
 
     vertex_limb: Tensor
     face_limb: Tensor
@@ -35,7 +35,7 @@ class Limbs:
 
     @staticmethod
     def of(rig: "Rig") -> "Limbs":
-        """Tell the limbs of a rig apart; one without their joints is all trunk."""
+        """Divide a rig into limbs; one without limb joints is all trunk."""
         of_joint = torch.zeros(len(rig.joints_m), dtype=torch.long)
         for joint, (name, parent) in enumerate(zip(rig.joint_names, rig.parents.tolist(), strict=True)):
             begins = name in FIRST_JOINTS
@@ -46,7 +46,7 @@ class Limbs:
         face_limb = corner_limbs.amax(1)
         on_cut = torch.zeros(len(vertex_limb), dtype=torch.bool, device=face_limb.device)
         on_cut[rig.faces[corner_limbs.amin(1) < face_limb].flatten()] = True
-        if not face_limb.any():  # nothing to tell apart, and none of the distances below
+        if not face_limb.any():  # nothing to divide, and no distances to compute
             return Limbs(vertex_limb, face_limb, on_cut, vertex_limb[:0], vertex_limb[:0], rig.vertices_m[:0])
         cell = torch.cat([(rig.vertices_m / SAMPLE_CELL_M).floor().long(), vertex_limb[:, None]], 1)
         cells, sample_of = torch.unique(cell, dim=0, return_inverse=True)
@@ -56,8 +56,8 @@ class Limbs:
         return Limbs(vertex_limb, face_limb, on_cut, samples, sample_of, rest_m)
 
     def close(self, vertices_m: Tensor) -> Tensor:
-        """Return which vertices of posed bodies (n, V, 3) came close to each of the L limbs, their own left out: (n, V,
-        L) bool."""
+        """Return which vertices of posed bodies (n, V, 3) come close to each of the L limbs, other than their own: (n,
+        V, L) bool."""
         if not len(self.samples):
             shape = len(vertices_m), len(self.vertex_limb), len(FIRST_JOINTS) + 1
             return torch.zeros(shape, dtype=torch.bool, device=vertices_m.device)
@@ -68,8 +68,8 @@ class Limbs:
 
 
 def _distances_m(points_m: Tensor, limb: Tensor) -> Tensor:
-    """Return the distance of points (P, 3), of limbs (P,), from the points of each limb, (P, L); infinite from a limb
-    without points, and from their own."""
+    """Return the distance of points (P, 3), on limbs (P,), from the points of each limb, (P, L); infinite for a limb
+    without points, and for a point's own limb."""
     distance_m = torch.cdist(points_m, points_m)
     nowhere = distance_m.new_full((len(points_m), 1), torch.inf)
     columns = [torch.cat([distance_m[:, limb == k], nowhere], 1).amin(1) for k in range(len(FIRST_JOINTS) + 1)]

@@ -21,8 +21,9 @@ class NormalEquations:
         self.coupling_diagonal = np.zeros((frames, unknowns))  # added to the diagonal by smoothness in time
 
     def add_points(self, matrix: Tensor, pull: Tensor, by_frame: Tensor, by_shared: Tensor) -> None:
-        """Add a term of points in space: its matrices (n, K, 3, 3) and gradients (n, K, 3) by the points, and the
-        points' derivatives by the frame's unknowns (n, K, 3, U) and by the first shared ones (n, K, 3, S)."""
+        """Add a term of points in space: its matrices (n, K, 3, 3) and gradients (n, K, 3) with respect to the points,
+        and the points' derivatives with respect to the frame's unknowns (n, K, 3, U) and the first shared ones (n, K,
+        3, S)."""
         own = by_shared.shape[-1]
         weighted = (matrix @ by_frame).flatten(1, 2)
         frame, shared, gradient = by_frame.flatten(1, 2), by_shared.flatten(1, 2), pull.flatten(1)[..., None]
@@ -36,9 +37,9 @@ class NormalEquations:
         """Solve for the step of the frames (n, U) and of the shared unknowns (S,), which stay between low and high
         (S,).
 
-        `damping` times the diagonal, without what couples frames, is added (Marquardt 1963): damping the coupling too
-        would hold back movement that all frames share. Shared unknowns that would leave their bounds are held at them,
-        and the rest solved again.
+        `damping` times the diagonal, without the terms that couple frames, is added (Marquardt 1963): damping the
+        coupling too would hold back movement that all frames share. Shared unknowns that would leave their bounds are
+        held at them, and the rest solved again.
         """
         frames, unknowns = self.frame_gradient.shape
         factor = (cholesky_banded(self._banded(damping), lower=True, check_finite=False), True)

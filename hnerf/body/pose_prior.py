@@ -76,7 +76,7 @@ def add_turn_prior(
     high: Tensor,
 ) -> float:  # fmt: skip
     """Add a Gaussian on turns (n, M, 3), the unknowns from `first` on, and one-sided limits to the normal equations;
-    return the cost. axes (M, 3, 3): rows flexion, twist, sideways; mean, std, low, high (M, 3) about these, in
+    return the cost. axes (M, 3, 3): rows flexion, twist, sideways; mean, std, low, high (M, 3): about these axes, in
     radians."""
     local = torch.einsum("mac,nmc->nma", axes, turns)
     off, excess, limit = local - mean, local - local.clamp(low, high), math.radians(LIMIT_STD_DEG) ** -2
@@ -122,19 +122,19 @@ class Smoothness:
     """A prior on the acceleration of keypoints between neighbouring frames (zero velocity would hold back real
     movement).
 
-    Geman-McClure weights let a sudden movement or a cut go. It does not act from one run of frames to the next.
+    Geman-McClure weights release it at a sudden movement or a cut. It does not act from one run of frames to the next.
     """
 
     def __init__(self, runs: list[tuple[int, ...]], fps: float, sigma_mps2: np.ndarray) -> None:
-        """Prepare the prior. runs: numbers of frames that follow each other; fps: of these numbers; sigma_mps2 (25,):
+        """Prepare the prior. runs: consecutive frame numbers; fps: frame rate of these numbers; sigma_mps2 (25,):
         standard deviations."""
         frames = [*itertools.chain(*runs)]
         starts = np.cumsum([0] + [len(run) for run in runs])
         triples = [np.arange(a, a + len(run) - 2) for a, run in zip(starts, runs, strict=False)]
-        self.first = np.concatenate(triples)  # first row of each three consecutive frames, (T,)
+        self.first = np.concatenate(triples)  # first row of each triple of consecutive frames, (T,)
         step, steps = median_step(frames), np.diff(frames)
         before, after = steps[self.first], steps[self.first + 1]
-        # (3, T): factors of three positions for their acceleration in median steps: 1, -2, 1 if evenly spaced
+        # (3, T): factors that turn three positions into their acceleration in median steps: 1, -2, 1 if evenly spaced
         divisors = np.stack([before * (before + after), -before * after, after * (before + after)])
         self.difference = 2 * step**2 / divisors
         self.sigma_m = sigma_mps2 * step**2 / fps**2

@@ -14,24 +14,24 @@ from hnerf.body.pose_prior import PosePrior
 from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
-# Standard deviation of a joint's turn, and deviation of another posture.
+# Standard deviation of a joint's turn, and deviation that means another posture.
 WRIST_STD_DEG, WRIST_OUTLIER_DEG = 5.0, 15.0
 TWISTED, TWIST_STD_DEG, TWIST_OUTLIER_DEG = ("upperarm01", "lowerarm01", "upperleg01"), 10.0, 40.0  # about their bones
 POSTURE_STD_DEG, POSTURE_OUTLIER_DEG = 7.0, 14.0
 MIN_STD_DEG = 2.0  # a first fit cannot show smaller ones
 SINGLE_POSTURE_STD_DEG = 0.1  # of joints that stand still
-KNOWN_TRUST = 0.5  # above it a posture is known well enough to be the only one
+KNOWN_TRUST = 0.5  # trust above which a posture is known well enough to be the only one
 CHI_MEDIAN = 1.54  # median length of a vector of three standard normal variables
 REGULARISATION = 1e-6  # keeps median turns where they are if no frame is trusted
 
 
 @dataclass(frozen=True)
 class PosturePrior:
-    """A Gaussian on each joint's turn about its median over a group of frames; Geman-McClure weights let another
-    posture go.
+    """A Gaussian on each joint's turn about its median over a group of frames; Geman-McClure weights release frames
+    with another posture.
 
-    groups: the frames' rows, each in one of them; trust (n, M - 1) by frame and free joint: 0 is none, 1 is full; std
-    (n, M - 1) and outlier (M - 1,) in radians; held (M - 1, 3, 3): projects a deviation onto the axes that are held.
+    groups: rows of frames, each in one group; trust (n, M - 1) by frame and free joint: 0 is none, 1 is full; std (n, M
+    - 1) and outlier (M - 1,) in radians; held (M - 1, 3, 3): projects a deviation onto the axes that are held.
     """
 
     groups: list[list[int]]
@@ -45,7 +45,7 @@ class PosturePrior:
         """Return a prior on wrists and on the twist of arms and thighs, over all frames.
 
         The body's keypoints hardly show how a straight limb twists, and not at all how a hand turns; in images of a few
-        hundred pixels, a network mistakes the turn of a hand in single frames.
+        hundred pixels, a network gets the turn of a hand wrong in single frames.
         """
         names = [articulation.rig.joint_names[joint].split(".")[0] for joint in articulation.joints[1:].tolist()]
         wrists, twisted = (torch.tensor([name in held for name in names]) for held in (("wrist",), TWISTED))
@@ -64,7 +64,7 @@ class PosturePrior:
         frames.
 
         Only then are the medians known in depth: one view hardly distinguishes a limb bent towards it from one bent
-        away. pose: as far as it is known, to tell how the body turns.
+        away. pose: the pose known so far, which tells how the body turns.
         """
         trust = torch.zeros(len(pose.root), len(Articulation(pose.rig).joints) - 1, dtype=pose.root.dtype)
         for rows in groups:
@@ -79,7 +79,7 @@ class PosturePrior:
 
     def with_learned_std(self, pose: Pose) -> "PosturePrior":
         """Return the prior with each joint's standard deviation as found in a first fit, between 2 degrees and the
-        present one: a person who stands still while turning is held to it, one who walks is not."""
+        current one: a person who stands still while turning is held to it, one who walks is not."""
         length = self._deviations(pose.theta[:, Articulation(pose.rig).joints[1:]]).norm(dim=-1) / CHI_MEDIAN
         std = self.std.clone()
         for rows in self.groups:
@@ -108,7 +108,7 @@ class PosturePrior:
         """Add the prior to the normal equations and return its cost.
 
         The medians are the last shared unknowns and move together with the frames' turns, so that a step does not hold
-        the frames to the medians from before it; after it the medians are computed anew.
+        the frames to the medians from before it; after it, the medians are recomputed.
         """
         off = self._deviations(pose.theta[:, articulation.joints[1:]])
         off = (self.held @ off[..., None])[..., 0]

@@ -8,9 +8,9 @@ from torch import Tensor
 from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
-NEAR_M = 0.1  # least depth: nothing nearer is in a camera's picture
+NEAR_M = 0.1  # least depth: nothing nearer is in a camera's image
 
-DataTerm = tuple[Tensor, Tensor, float]  # of each point: matrices (n, K, 3, 3), gradients (n, K, 3), and the cost
+DataTerm = tuple[Tensor, Tensor, float]  # each point's matrix (n, K, 3, 3) and gradient (n, K, 3), and the cost
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,12 @@ class Views:
     confidence: Tensor
 
     def of(self, points: list[int]) -> "Views":
-        """Return some of the points."""
+        """Return the views of some of the points."""
         return Views(self.cameras, self.pixels[..., points, :], self.confidence[..., points])
 
 
 def project(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return pixels (..., 2) of world points, and their derivative by the points (..., 2, 3)."""
+    """Return pixels (..., 2) of world points, and their derivative with respect to the points (..., 2, 3)."""
     projection = torch.from_numpy(camera.projection)
     h = x @ projection[:, :3].T + projection[:, 3]
     depth = h[..., 2:].clamp(min=NEAR_M)
@@ -38,7 +38,8 @@ def project(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
 def reprojection_term(views: Views, scale_m: Tensor, x: Tensor, std_m: float, outlier_m: float) -> DataTerm:
     """Return the data term of points x (n, K, 3) against their views, with pixel residuals converted to metres.
 
-    scale_m (C, n): metres a pixel spans; std_m: of a point seen with full confidence; outlier_m: see `geman_mcclure`.
+    scale_m (C, n): metres a pixel spans; std_m: standard deviation of a point seen with full confidence; outlier_m: see
+    `geman_mcclure`.
     """
     matrix = torch.zeros(*x.shape, 3, dtype=x.dtype)
     pull, cost = torch.zeros_like(x), 0.0

@@ -20,12 +20,12 @@ from torch import Tensor
 
 from hnerf.body.limbs import Limbs
 
-AXES = {  # of the arrays of Rig, as its docstring names them; P keypoints
+AXES = {  # of Rig's arrays, in the letters of its docstring; P: keypoints
     "vertices_m": "V3", "faces": "F3", "joints_m": "J3", "joint_names": "J", "parents": "J", "beta": "B",
     "beta_names": "B", "shape_basis": "BV3", "joint_basis": "BJ3", "skin_joints": "VK", "skin_weights": "VK",
     "free": "J", "keypoint_weights": "PV",
 }  # fmt: skip
-INDICES = {"faces": "V", "parents": "J", "skin_joints": "J"}  # what the values of these count
+INDICES = {"faces": "V", "parents": "J", "skin_joints": "J"}  # the axis that the values of these arrays index
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Rig:
         return dense.scatter_add_(1, self.skin_joints, self.skin_weights)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Rig":
-        """Return the same rig on another device; `dtype` changes the floating tensors only."""
+        """Return the same rig on another device; `dtype` changes the floating-point tensors only."""
         changed: dict[str, Any] = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -152,7 +152,7 @@ def joint_transforms(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
 
 
 def posed_joint_basis(rig: Rig, world: Tensor, root: Tensor) -> Tensor:
-    """Return how a unit of each shape moves the posed joints, (n, J, 3, B) metres. world (n, J, 4, 4):
+    """Return how a unit of each shape value moves the posed joints, (n, J, 3, B) metres. world (n, J, 4, 4):
     `joint_transforms`; root (n, 4, 4)."""
     offsets = _relative_to_parent(rig, rig.joint_basis.transpose(0, 1)).transpose(1, 2)  # (J, 3, B)
     turned = world[:, rig.parents.clamp(min=0), :3, :3] @ offsets
@@ -161,8 +161,8 @@ def posed_joint_basis(rig: Rig, world: Tensor, root: Tensor) -> Tensor:
 
 
 def skinning_transforms(world: Tensor, joints_m: Tensor) -> Tensor:
-    """Return world from rest pose for a point rigidly on each joint, (..., J, 4, 4): G_j [I | -joint_j]. world: G, of
-    `joint_transforms`; joints_m (J, 3) at rest."""
+    """Return world from rest pose for a point rigidly attached to each joint, (..., J, 4, 4): G_j [I | -joint_j].
+    world: G, of `joint_transforms`; joints_m (J, 3) at rest."""
     moved = world[..., :3, 3] - (world[..., :3, :3] @ joints_m[..., None])[..., 0]
     return torch.cat([torch.cat([world[..., :3, :3], moved[..., None]], -1), world[..., 3:, :]], -2)
 

@@ -1,8 +1,8 @@
-"""Joint names: those that exported skeletons have, and those of the same joints in other skeletons.
+"""Joint names of exported skeletons, and the names of the same joints in other skeletons.
 
-Exported names are the field's own, with `_L` and `_R` as Blender mirrors them. Other skeletons: Unreal Engine 5
-(Manny), Mixamo (its prefix "mixamorig:" left out), HumanIK (Maya, MotionBuilder), VRM 1.0 humanoid, SMPL-X (joint names
-of its package), and CMU's motion capture database as it is found in BVH files.
+Exported names are those common in the field, with `_L` and `_R` so that Blender can mirror them. Other skeletons:
+Unreal Engine 5 (Manny), Mixamo (its prefix "mixamorig:" left out), HumanIK (Maya, MotionBuilder), VRM 1.0 humanoid,
+SMPL-X (joint names of its package), and CMU's motion capture database as it is found in BVH files.
 """
 
 import re
@@ -25,7 +25,7 @@ _RENAMED |= {f"finger{k}-{s}": f"{name}_0{s}" for k, name in enumerate(FINGERS, 
 _RENAMED |= {f"metacarpal{k}": f"{name}_metacarpal" for k, name in enumerate(FINGERS[1:], 1)}
 _RENAMED |= {f"toe{k}-{s}": f"{name}_0{s}" for k, name in enumerate(_TOES, 1) for s in (1, 2, 3)}
 
-# Joints in series with another, and toes beside the middle one, which the game skeleton does without.
+# Joints in series with another, and toes other than the middle one: the game skeleton omits these.
 _SERIAL = re.compile(
     r"(hip|thigh_twist|calf_twist|spine_02|spine_04|shoulder|upperarm_twist|forearm_twist|neck_02|neck_03"
     r"|\w+_metacarpal|(big|second|fourth|little)_toe_0\d|middle_toe_0[23])(_[LR])?"
@@ -51,7 +51,7 @@ def exported_name(joint: str) -> str:
 
 
 def is_serial(joint: str) -> bool:
-    """Return whether the game skeleton does without this exported joint."""
+    """Return whether the game skeleton omits this exported joint."""
     return _SERIAL.fullmatch(joint) is not None
 
 
@@ -110,6 +110,6 @@ EQUIVALENTS: dict[str, Names] = {
 
 
 def exported_from(skeleton: str) -> dict[str, str]:
-    """Return the exported names by the names of another skeleton, one of SKELETONS."""
+    """Return a mapping from the names of another skeleton, one of SKELETONS, to exported names."""
     named = {getattr(names, skeleton): joint for joint, names in EQUIVALENTS.items()}
     return {theirs: ours for theirs, ours in named.items() if theirs}

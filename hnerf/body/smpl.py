@@ -1,7 +1,7 @@
 """SMPL (Loper et al. 2015), SMPL-H (Romero et al. 2017) and SMPL-X (Pavlakos et al. 2019) as a Rig, from a model file
-that the user has; none is shipped.
+that the user provides; none is shipped.
 
-Joints that anny has too take anny's names, so that pose priors and exports know them. The rest pose is also anny's,
+Joints that anny also has take anny's names, so that pose priors and exports know them. The rest pose is also anny's,
 arms and knees a little bent, because pose priors, hinges and the start of a fit refer to it: SMPL's T pose would leave
 hinges without an axis. Pose blend shapes (`posedirs`) are evaluated once, for that rest pose; in other poses the rig
 has none, so bent joints are less full than SMPL's own. Fingers, toes, jaw and eyes are locked. Expressions are left
@@ -66,7 +66,7 @@ BODY_25: tuple[tuple[str, ...] | tuple[int, int], ...] = (
     ("lowerleg01.R",), ("foot.R",), ("upperleg01.L",), ("lowerleg01.L",), ("foot.L",), (6260, 9929), (2800, 9448),
     (4071, 616), (583, 6), (3216, 5770), (3226, 5780), (3387, 8846), (6617, 8463), (6624, 8474), (6787, 8635),
 )  # fmt: skip
-MESHES = {6890: 0, 10475: 1}  # by number of vertices: which index of such a pair
+MESHES = {6890: 0, 10475: 1}  # by number of vertices: which index of such a pair to use
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Smpl:
 
 
 def read_smpl(path: Path) -> Smpl:
-    """Read the model in a .npz or .pkl file. Raises InputError where the file is missing or holds no SMPL, SMPL-H or
+    """Read the model in a .npz or .pkl file. Raises InputError if the file is missing or holds no SMPL, SMPL-H or
     SMPL-X model."""
     data = _checked(path, _read(path))
     weights, regressor = data["weights"], data["J_regressor"]
@@ -121,8 +121,9 @@ def read_smpl(path: Path) -> Smpl:
 
 
 def rest_rotations(names: tuple[str, ...], parents: list[int], t_pose: dict[str, Tensor]) -> Tensor:
-    """Return each bone's rotation (J, 3, 3) from SMPL's T pose, with bone directions t_pose by joint, to anny's rest
-    pose, body frame: limbs rotate by the shortest way, feet and trunk do not, all other bones follow their parent."""
+    """Return each bone's rotation (J, 3, 3), body frame, from SMPL's T pose, with bone directions t_pose by joint, to
+    anny's rest pose: limbs take the shortest rotation, feet and trunk do not rotate, all other bones follow their
+    parent."""
     rotations: list[Tensor] = []
     for name, parent in zip(names, parents, strict=True):
         above = rotations[parent] if parent >= 0 else torch.eye(3, dtype=torch.float64)
@@ -189,8 +190,8 @@ def _checked(path: Path, data: dict[str, Any]) -> dict[str, Tensor]:
 
 
 def _wrong_numbers(arrays: dict[str, Tensor]) -> list[str]:
-    """Return which arrays, of a model's shapes, hold NaN, parents below their children or vertices that are not
-    there."""
+    """Return which arrays, though their shapes are right, hold NaN, parents below their children or vertices that do
+    not exist."""
     wrong = [key for key in KEYS if not arrays[key].isfinite().all()]
     above, faces = arrays["kintree_table"][0, 1:], arrays["f"]
     wrong += [] if ((above >= 0) & (above < torch.arange(1, len(above) + 1))).all() else ["kintree_table"]
@@ -237,8 +238,7 @@ def _keypoint_weights(names: tuple[str, ...], regressor: Tensor, mesh: int) -> T
 
 
 def _moved_off(weights: Tensor, vertices_m: Tensor, kept: Tensor) -> Tensor:
-    """Return weights (25, kept V) in which the weight of each vertex that is not kept goes to the nearest one that
-    is."""
+    """Return weights (25, kept V) in which each dropped vertex gives its weight to the nearest one that is kept."""
     for v in ((weights != 0).any(0) & ~kept).nonzero()[:, 0].tolist():
         distance = (vertices_m - vertices_m[v]).norm(dim=1).where(kept, torch.inf)
         weights[:, distance.argmin()] += weights[:, v]
