@@ -18,9 +18,8 @@ def antialiased(
     """Return an image (H, W, 5): colour, coverage and depth, 0 outside `visible` (H, W) bool.
 
     render_rays_at: maps points (N, 2) of the image, (x, y) in pixels, to what their rays see, (N, 5). render_beside:
-    the same for points that are moved by offsets (M, 2) in pixels each, (M, N, 5). Of mixed pixels the colour and the
-    coverage are means over four quarters; depth is that of the centre, since a mean of near and far lies on neither
-    surface.
+    the same for these points, each moved by offsets (M, 2) in pixels, (M, N, 5). In mixed pixels, colour and coverage
+    are means over four quarters; depth is that of the centre, since a mean of near and far lies on neither surface.
     """
     centres = _pixels(visible)
     seen = render_rays_at(centres)

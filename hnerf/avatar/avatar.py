@@ -1,4 +1,4 @@
-"""Interface of a trained person to evaluation and export, whatever its field."""
+"""The interface that a trained person offers to evaluation and export, whatever its field."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -43,9 +43,9 @@ class Avatar(Protocol):
         ...
 
     def frame_displacements(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
-        """Return how far what was learned for the frames of poses theta (n, J, 3), root (n, 4, 4) moves the surface
-        next to points (N, 3) around the body at rest, beside where it is in a pose of no frame: (n, N, 3), in the axes
-        of the body at rest."""
+        """Return how far the surface next to points (N, 3) around the body at rest is moved by what was learned for the
+        frames of poses theta (n, J, 3), root (n, 4, 4), relative to a pose of no frame: (n, N, 3), in the axes of the
+        body at rest."""
         ...
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:

@@ -1,4 +1,4 @@
-"""Files of a finished run that nobody has compared with their digests, as in a copy of a subject's folder."""
+"""Files of a finished run whose digests were not checked, such as those in a copy of a subject's folder."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -16,7 +16,7 @@ from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
 from hnerf.config import TrainingSettings
 from hnerf.errors import InputError, one_line
 
-# SystemError: OpenCV's, of YAML that is cut. A disk's own faults (OSError) stay what they are.
+# OpenCV raises SystemError on truncated YAML. Faults of the disk itself (OSError) pass unchanged.
 DAMAGED = (
     *(kind for kind in ARRAY_FILE_ERRORS if kind is not OSError), IndexError, SafetensorError, SystemError, cv2.error,
 )  # fmt: skip
@@ -24,8 +24,8 @@ DAMAGED = (
 
 @contextmanager
 def readable(part: Path) -> Iterator[None]:
-    """Raise InputError that names this file or folder of a run if it cannot be read inside: it is cut, or another
-    version's."""
+    """Raise InputError, naming this file or folder of a run, if reading it inside the context fails: it is truncated,
+    or another version wrote it."""
     try:
         yield
     except DAMAGED as error:
@@ -64,8 +64,8 @@ def reason_without_novel_poses(training: Path) -> str | None:
 
 
 def require_poses(subject: Path, what: str) -> None:
-    """Raise InputError if the model of a subject's folder cannot show poses that it was not trained on; what: is wanted
-    of it."""
+    """Raise InputError if the model of a subject's folder cannot show poses that it was not trained on; what: the
+    request, which needs them."""
     with readable(subject / "training"):
         reason = reason_without_novel_poses(subject / "training")
     if reason:

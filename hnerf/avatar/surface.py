@@ -1,4 +1,4 @@
-"""The zero surface of a signed distance field: as a closed triangle mesh, and under a mesh that is near it."""
+"""The zero surface of a signed distance field: as a closed triangle mesh, and as the target of a nearby mesh."""
 
 import itertools
 import math
@@ -49,8 +49,8 @@ def move_onto_surface(
 
 
 def step_to_surface(distance_m: Tensor) -> Tensor:
-    """Return the distances (V,) to step back along the normal: all of them up to half of MAX_STEP_M, and less beyond,
-    down to 0 where the zero surface belongs to another limb."""
+    """Return the distances (V,) to step back along the normal: the whole distance up to half of MAX_STEP_M, less
+    beyond, down to 0 where the zero surface belongs to another limb."""
     return distance_m * (2 - 2 * distance_m.abs() / MAX_STEP_M).clamp(0, 1)
 
 
@@ -61,7 +61,7 @@ def normals_and_distances(
     values at the corners of a tetrahedron, `step_m` from each point: the sum of the corners, weighted by the values
     there, and the mean of the values."""
     corners = TETRAHEDRON.to(points_m)
-    at_m = points_m + step_m * corners[:, None]  # (4, N, 3), asked for at once, since each call poses the body anew
+    at_m = points_m + step_m * corners[:, None]  # (4, N, 3), queried at once, since each call poses the body again
     values_m = avatar.signed_distance(at_m.flatten(0, 1), theta, root).view(at_m.shape[:2])
     return torch.nn.functional.normalize(values_m.T @ corners, dim=1), values_m.mean(0)
 

@@ -32,7 +32,7 @@ from hnerf.geometry.camera import Camera
 RAYS_PER_BATCH = 16384
 SAMPLES_PER_BATCH = 1 << 20  # coarse ones, for fields with many per ray: a network keeps some KiB for each
 POINTS_PER_BATCH = 1 << 17
-GPU_BATCHES = 4  # times as many: a GPU waits for the launches of smaller ones
+GPU_BATCHES = 4  # factor on a GPU, which would wait for the launches of smaller ones
 FIELDS: dict[type[config.FieldSettings], type[Field]] = {
     config.FastFieldSettings: FastField,
     config.PaperFieldSettings: PaperField,
@@ -108,8 +108,8 @@ class TrainedAvatar:
 
     @torch.no_grad()
     def frame_displacements(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
-        """Return how far what was learned for single frames moves the surface next to points (N, 3) around the body at
-        rest, (n, N, 3), for poses theta (n, J, 3), root (n, 4, 4)."""
+        """Return how far the surface next to points (N, 3) around the body at rest, (n, N, 3), is moved by what was
+        learned for the frames of poses theta (n, J, 3), root (n, 4, 4)."""
         bodies, _ = self._pose(torch.zeros_like(theta[0]), torch.eye(4).to(root))
         rows = torch.cat([self._frame_row(*pose) for pose in zip(theta, root, strict=True)])
         return self.field.frame_displacements(bodies, points_m, rows)
@@ -134,15 +134,15 @@ class TrainedAvatar:
         return bodies, Conditions.of(rig, theta[None], root[None], self._frame_row(theta, root), self.scene_m)
 
     def _frame_row(self, theta: Tensor, root: Tensor) -> Tensor:
-        """Return the learned row (1,) with the same joint angles theta, the one with the closest root if several, -1 if
-        none."""
+        """Return the learned row (1,) with the same joint angles theta: of several, the one with the closest root; -1
+        if there is none."""
         same = torch.nonzero((self.learned.theta == theta).flatten(1).all(1))[:, 0]
         apart = (self.learned.root[same] - root).flatten(1).norm(dim=1)
         return same[apart.argmin(keepdim=True)] if len(same) else torch.full((1,), -1, device=theta.device)
 
 
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
-    """Load the subject that training left in `folder`. Raises InputError if another version left it."""
+    """Load the subject that training left in `folder`. Raises InputError if another version wrote it."""
     settings, static, gains = _stored_settings(folder / "settings.json")
     body = BodyFit.load(folder).to(device)
     path = folder / "model.safetensors"

@@ -1,4 +1,4 @@
-"""Common bases of the compared methods: rays are sampled in the person's box, and in its coordinates."""
+"""Common base classes of the compared methods: rays are sampled in the person's box, and in its coordinates."""
 
 from abc import abstractmethod
 from typing import Any, Self
@@ -23,9 +23,9 @@ class BoxField(Field):
     and 1. Densities are per unit of these coordinates.
 
     The methods were published for a bounded object, a person cut out of the image, or a whole scene; here the
-    background comes from the clean plate, so rays are sampled in the person's box only. Training draws them from all
-    pixels that see it, a third of them at outlines of the person, as for H-NeRF's preset `fast`. Outside the box the
-    networks were never trained, so the surface ends there.
+    background comes from the clean plate, so rays are sampled in the person's box only. Training draws rays from all
+    pixels that see the box, a third of them at outlines of the person, as for H-NeRF's preset `fast`. Outside the box
+    the networks were never trained, so the surface ends there.
     """
 
     centre_m: Tensor
@@ -33,8 +33,8 @@ class BoxField(Field):
 
     @classmethod
     def build(cls, body: BodyFit, settings: Any, static: bool) -> Self:
-        """Return an untrained field; those that model one moment are never given more."""
-        return cls(body, settings)  # type: ignore[call-arg]  # as all that derive from this are constructed
+        """Return an untrained field; those that model one moment never get more frames."""
+        return cls(body, settings)  # type: ignore[call-arg]  # how all derived classes are constructed
 
     def __init__(self, body: BodyFit, samples: int, learning_rate: float):
         super().__init__()
@@ -105,7 +105,7 @@ class DynamicField(BoxField):
 
 
 def box_samples(alpha: Tensor, colour: Tensor, d: Tensor, **given: Any) -> RaySamples:
-    """Return the samples of a field that knows no body: in the box, of one opacity, with no residual and no gradients,
-    unless these are given."""
+    """Return the samples of a field that knows no body: all in the box, with a single opacity, no residual and no
+    gradients, unless these are given."""
     known = {"alpha_dot": alpha, "in_box": torch.ones_like(d), "density": None, "residual": torch.zeros_like(d)}
     return RaySamples(alpha=alpha, colour=colour, d=d, **(known | {"gradient_norm": d.new_zeros(0)} | given))

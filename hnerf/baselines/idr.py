@@ -76,7 +76,7 @@ class IdrField(StaticField):
     misses it.
     """
 
-    gamma = 50.0  # a metre: sharpness of the mask loss
+    gamma = 50.0  # per metre: sharpness of the mask loss
 
     def __init__(self, body: BodyFit, settings: IdrSettings):
         super().__init__(body, settings.samples, settings.learning_rate)
@@ -145,8 +145,9 @@ class IdrField(StaticField):
 
 
 def intersection(points_m: Tensor, directions: Tensor, distance: Tensor, gradient: Tensor) -> Tensor:
-    """Return the points x0 (N, 3) with the derivative of the true intersection by theta: x^ = x0 - v f(x0; theta) /
-    (grad f(x0; theta0) . v0) (equation 3). distance f (N,) with its graph, gradient (N, 3), directions v (N, 3)."""
+    """Return the points x0 (N, 3) with the derivative of the true intersection with respect to theta: x^ = x0 - v f(x0;
+    theta) / (grad f(x0; theta0) . v0) (equation 3). distance f (N,) with its graph, gradient (N, 3), directions v (N,
+    3)."""
     slope = (gradient.detach() * directions).sum(-1).clamp(max=-MIN_SLOPE)
     return points_m - directions * ((distance - distance.detach()) / slope)[:, None]
 
@@ -172,7 +173,7 @@ def trace_surface(
 
 
 def _sphere_trace(distance: Callable[[Tensor], Tensor], rays: Rays, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-    """Trace spheres from near; return depths (R,), and whether they ended on the surface."""
+    """Sphere-trace rays from near; return depths (R,), and whether they ended on the surface."""
     depths, hit, moving = near.clone(), torch.zeros_like(near, dtype=torch.bool), near < far
     for _ in range(TRACE_STEPS):
         pick = torch.nonzero(moving)[:, 0]

@@ -18,7 +18,7 @@ from hnerf.fields.shell import Boxes, stratified
 
 LAYERS = 8
 POSITION_OCTAVES, VIEW_OCTAVES = 10, 4
-DENSITY_GAIN = 10.0  # an opaque surface has densities of tens to hundreds, which few steps could not reach otherwise
+DENSITY_GAIN = 10.0  # an opaque surface has densities of tens to hundreds, out of reach of few steps otherwise
 
 
 class NerfNetwork(nn.Module):
@@ -41,8 +41,8 @@ class NerfNetwork(nn.Module):
 
 
 class NerfField(StaticField):
-    """Static field: a coarse and a fine network, hierarchical sampling, view-dependent colour; of the body only its
-    box.
+    """Static field: a coarse and a fine network, hierarchical sampling, view-dependent colour. Of the body it uses only
+    the box.
 
     The first samples of a ray belong to the coarse network; their opacity is `alpha_dot`, that of the fine network's
     samples is `alpha`, each zero at the samples of the other. So the loss `reconstruction` is that of the fine colour,

@@ -47,18 +47,18 @@ class Deformation(nn.Module):
 
 
 class NerfiesField(DynamicField):
-    """Dynamic field: each frame's code deforms the space of its instant into one template, a NeRF; of the body only its
-    box.
+    """Dynamic field: each frame's code deforms the space of its instant into one template, a NeRF. Of the body it uses
+    only the box.
 
     It has no pose control. A pose of no frame (Conditions.frame_row = -1) and a frame that was not trained on take the
-    zero code: the template as this code deforms it, the same for every pose, cut by the pose's box. Where that box is
-    elsewhere there is little or nothing.
+    zero code: the template as this code deforms it, the same for every pose, cut by the pose's box. If that box is
+    elsewhere, it shows little or nothing.
 
-    Simplified: one template network serves coarse and fine samples, and only the fine pass is trained, as H-NeRF does
-    it; networks and numbers of samples are smaller, so that minutes on two CPU cores are meaningful; no appearance
-    codes, because the captures' cameras keep their exposure; no regularisation of static background points, because the
+    Simplified: one template network serves coarse and fine samples, and only the fine pass is trained, as in H-NeRF;
+    networks and numbers of samples are smaller, so that minutes on two CPU cores are meaningful; no appearance codes,
+    because the captures' cameras keep their exposure; no regularisation of static background points, because the
     background comes from the clean plate; the elastic energy, weighted by a sample's contribution to its pixel, is
-    estimated at one sample per ray drawn by that weight. Activations and the mean absolute colour error are those of
+    estimated at one sample per ray, drawn by that weight. Activations and the mean absolute colour error are those of
     NerfField.
     """
 
@@ -98,7 +98,7 @@ class NerfiesField(DynamicField):
         return dataclasses.replace(samples, elastic=weights.sum(1) * elastic_energy(change)), depths
 
     def on_progress(self, progress: float) -> None:
-        """Note how far training has come, for annealing."""
+        """Record the progress of training, for annealing."""
         self.progress.fill_(progress)
 
     def _deform(self, points: Tensor, code: Tensor) -> Tensor:

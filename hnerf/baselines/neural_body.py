@@ -78,9 +78,9 @@ class NeuralBodyField(DynamicField):
     the frame's appearance, which is zero for poses that were not trained.
 
     Simplified: voxels of `voxel_m` (5 mm in the paper), one convolution between those of stride 2 where the paper has
-    two or three, fewer channels, narrower networks, shorter codes of frames (128 wide in the paper) and fewer samples
-    (64 in the paper), so that minutes on two CPU cores are meaningful; layers are normalised by voxel, not by batch, so
-    that a frame does not depend on what is trained beside it; Swish instead of ReLU, and softplus for the density, as
+    two or three, fewer channels, narrower networks, shorter frame codes (128 wide in the paper) and fewer samples (64
+    in the paper), so that minutes on two CPU cores are meaningful; layers are normalised by voxel, not by batch, so
+    that a frame does not depend on what else is in its batch; Swish instead of ReLU, and softplus for the density, as
     in NerfField; the mean absolute colour error as for all compared methods, not the squared one; codes of a voxel's
     vertices are averaged.
 

@@ -1,6 +1,6 @@
 """Sparse voxels around a body with their neighbours' rows, so that convolutions are gathers and matrix products.
 
-A voxel has integer coordinates (N, 3) and stands for the point at that many voxel edges from the lower corner. The next
+A voxel has integer coordinates (N, 3) and represents the point at that many voxel edges from the lower corner. The next
 coarser level has every second coordinate; a voxel is active there if its 3 x 3 x 3 stencil on the finer level contains
 an active one (the stride-2 sparse convolution of Graham et al. 2018).
 """
@@ -18,7 +18,7 @@ CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # of a cell; also the ro
 
 @dataclass(frozen=True)
 class Level:
-    """Active voxels of one resolution, N of them; row N stands for an empty one.
+    """Active voxels of one resolution, N of them; row N is an empty one.
 
     rows (X, Y, Z) int32: the row at each coordinate, padded; neighbours (N, 27) int32: rows of the stencil;
     finer_neighbours (N, 27) int32: rows of the finer level's stencil around the same point, without entries at the

@@ -24,9 +24,10 @@ class Field(nn.Module, ABC):
 
     canonical_m (V, 3): the rig's canonical vertices, saved with the field. samples: random numbers needed per ray.
     gamma: sharpness of the silhouette, per unit of the distances that `sample` returns. margin_m: how far around the
-    body's extent anything can be visible. models_background: the field models the photograph's background, else it is
-    composited over the clean plate. whole_images: training draws from all pixels, else from `visible_pixels` and those
-    of the mask. common_rest: the rest body takes over what training changes in all poses alike.
+    body's extent anything can be visible. models_background: whether the field models the photograph's background;
+    otherwise it is composited over the clean plate. whole_images: whether training draws from all pixels, or only from
+    `visible_pixels` and the mask's. common_rest: whether the rest body absorbs changes that training makes to all poses
+    alike.
     """
 
     models_background: ClassVar[bool] = False
@@ -34,7 +35,7 @@ class Field(nn.Module, ABC):
     whole_images: bool = False
     canonical_m: Tensor
     samples: int
-    gamma: float = 80.0  # a metre: the paper's 200 in a scene of 2.5 m
+    gamma: float = 80.0  # per metre: the paper's 200 in a scene of 2.5 m
     margin_m: float = 0.1
 
     @classmethod
@@ -47,17 +48,17 @@ class Field(nn.Module, ABC):
         """Return where rays are sampled, by body row."""
 
     def scene(self, bodies: PosedBodies, conditions: Conditions) -> PosedScene[Any]:
-        """Return what rays around these bodies are evaluated in."""
+        """Return the scene in which rays around these bodies are evaluated."""
         return PosedScene(bodies, self.region(bodies, conditions), conditions)
 
     def tighten(self, rig: Rig, pose: Tensor) -> None:
-        """Shrink the region to what is visible in some poses (n, P)."""
+        """Shrink the region to what is visible in the given poses (n, P)."""
 
     def average_over_frames(self, rows: Tensor) -> None:
         """Give poses outside the frames of `rows` (n,) the mean of what was learned for these frames."""
 
     def visible_pixels(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
-        """Return the pixels (H, W) bool that can show anything of a body with vertices (V, 3)."""
+        """Return the pixels (H, W) bool that can show any part of a body with vertices (V, 3)."""
         return within_box(camera, vertices_m, self.margin_m)
 
     @abstractmethod
@@ -65,11 +66,12 @@ class Field(nn.Module, ABC):
         """Return parameter groups for Adam."""
 
     def compile_networks(self) -> None:
-        """Have torch fuse the operations of networks whose time goes into moving activations, for training on a GPU."""
+        """Have torch fuse the operations of networks that spend their time moving activations, for training on a
+        GPU."""
 
     def frame_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters of single frames, with frames as first axis; for novel frames they are fitted to the
-        finished field, as poses are."""
+        """Return the parameters that belong to single frames, frames on the first axis. For novel frames they are
+        fitted to the finished field, as poses are."""
         return []
 
     @abstractmethod
@@ -81,8 +83,8 @@ class Field(nn.Module, ABC):
         return self.samples
 
     def on_progress(self, progress: float) -> None:
-        """Note how far the field's training has come, from 0 to 1; called after each of its steps but the last,
-        whatever the number of their parts."""
+        """Record the progress of the field's training, from 0 to 1. Called once after each step but the last, however
+        many parts a step has."""
 
     def samples_needed(self, region: Any, rays: Rays) -> Tensor:
         """Return the number of samples that rendering takes along R rays: (R,) long, 0 where nothing is visible."""
@@ -99,12 +101,12 @@ class Field(nn.Module, ABC):
         return rendered
 
     def render_beside(self, scene: PosedScene[Any], rays: Rays, directions: Tensor) -> Tensor:
-        """Render M rays beside each of R rays, from the same origins along unit directions (M, R, 3) that are close to
-        theirs, as `render_rays` does: (M, R, 5)."""
+        """Render M neighbours of each of R rays as `render_rays` does: (M, R, 5). They have the same origins, and unit
+        directions (M, R, 3) close to those of the rays."""
         return torch.stack([self.render_rays(scene, Rays(rays.origins_m, d, rays.frame)) for d in directions])
 
     def _by_samples(self, scene: PosedScene[Any], rays: Rays) -> Iterator[tuple[Tensor, Draws]]:
-        """Yield the rays that see anything, (N,) long, by the number of their samples, with what they draw."""
+        """Yield the rays that see anything, (N,) long, grouped by their number of samples, with their draws."""
         needed = self.samples_needed(scene.region, rays)
         for count in needed[needed > 0].unique().tolist():
             pick = torch.nonzero(needed == count)[:, 0]
@@ -115,8 +117,8 @@ class Field(nn.Module, ABC):
         return 1 - (1 - samples.in_box * samples.alpha).prod(1)
 
     def frame_displacements(self, bodies: PosedBodies, points_m: Tensor, frame_row: Tensor) -> Tensor:
-        """Return how far rows `frame_row` (n,) move the surface next to points (N, 3) around the first body, the one at
-        rest, beside where it is in a pose of no frame, (n, N, 3)."""
+        """Return how far the frames of rows `frame_row` (n,) move the surface next to points (N, 3) around the first
+        body, which is at rest, from where it is in a pose of no frame, (n, N, 3)."""
         return points_m.new_zeros(len(frame_row), *points_m.shape)
 
     @abstractmethod

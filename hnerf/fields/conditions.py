@@ -1,4 +1,4 @@
-"""Conditioning of the fields beside the sample point, and the random numbers of one step."""
+"""What fields are conditioned on in addition to the sample point, and the random numbers of one step."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -69,8 +69,8 @@ class Draws:
 
 
 def shard(batch: Batch, rank: int, world_size: int) -> Batch:
-    """Return this rank's rays of a joint batch, a dataclass whose tensors all have rays as first axis. Rays are
-    contiguous, so that a share has few frames."""
+    """Return this rank's rays of a joint batch, a dataclass whose tensors all have rays as first axis. Shares are
+    contiguous, so that each has few frames."""
     values = {f.name: getattr(batch, f.name) for f in dataclasses.fields(batch)}
     return dataclasses.replace(
         batch, **{k: v if v is None else v.tensor_split(world_size)[rank] for k, v in values.items()}

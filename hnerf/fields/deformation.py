@@ -1,4 +1,5 @@
-"""Per-frame deformation: what skinning leaves over, as displacements of the canonical surface (docs/method.md)."""
+"""Per-frame deformation: what skinning leaves unexplained, as displacements of the canonical surface
+(docs/method.md)."""
 
 import numpy as np
 import torch
@@ -7,8 +8,8 @@ from torch import Tensor, nn
 from hnerf.body.canonical import Descriptor, distinct_rows, weighted_sum
 from hnerf.body.descriptor import vertex_normals
 
-TINY = 1e-9  # m^2: where every vertex is a node, too, nodes have a width
-OVERLAP = 0.5  # width of a node's Gaussian, in greatest distances of a vertex from its closest node
+TINY = 1e-9  # m^2: gives nodes a width even if every vertex is a node
+OVERLAP = 0.5  # width of a node's Gaussian, relative to the greatest distance of a vertex from its closest node
 
 
 class FrameDeformation(nn.Module):
@@ -57,14 +58,14 @@ class FrameDeformation(nn.Module):
     def _vertex_displacement(self, rows: Tensor) -> Tensor:
         """Return the displacement of the vertices for some rows of `displacement`, and its component along their
         normals: (n, V, 4)."""
-        every_row = self.displacement[rows].transpose(0, 1).flatten(1)  # (nodes, 3 n), for one product of matrices
+        every_row = self.displacement[rows].transpose(0, 1).flatten(1)  # (nodes, 3 n), for a single matrix product
         moved = (self.node_weights @ every_row).unflatten(1, (-1, 3)).transpose(0, 1)
         return torch.cat([moved, (moved * self.normals).sum(-1, keepdim=True)], -1)
 
 
 def farthest_points(points_m: np.ndarray, count: int) -> list[int]:
-    """Return indices of points by farthest point sampling: the first, then always the one farthest from those chosen
-    before (Gonzalez 1985)."""
+    """Return indices of points by farthest point sampling: the first point, then always the one farthest from those
+    already chosen (Gonzalez 1985)."""
     chosen = [0]
     distance_m = np.linalg.norm(points_m - points_m[0], axis=1)
     while len(chosen) < count:

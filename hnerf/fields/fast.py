@@ -35,7 +35,7 @@ HALF_SAMPLES_UNTIL = 0.75  # of the training: as accurate on three captures, in 
 MAX_NEIGHBOUR_DISTANCE_M = 0.03  # canonical; neighbours on a ray that are farther apart lie on different limbs
 MIN_DESCENT_M = 1e-4  # of d_hat from one sample to the next; below it the surface position has no useful derivative
 MIN_COLOUR_WEIGHT = 1e-3  # samples of less weight are not coloured
-MIN_SHOWN_WEIGHT = 1e-2  # the same in rendering, where the coloured ones take their weight: - 0.002 dB on valid-wave
+MIN_SHOWN_WEIGHT = 1e-2  # the same in rendering, where coloured ones take over their weight: - 0.002 dB on valid-wave
 
 
 class FastField(Field):
@@ -50,7 +50,7 @@ class FastField(Field):
 
     @classmethod
     def build(cls, body: BodyFit, settings: FastFieldSettings, static: bool) -> "FastField":
-        """Return an untrained field; one training frame or many make no difference."""
+        """Return an untrained field, the same for one training frame or many."""
         return cls(body.rig, settings, len(body.frames))
 
     def __init__(self, rig: Rig, settings: FastFieldSettings, frames: int):
@@ -100,9 +100,9 @@ class FastField(Field):
 
     @torch.no_grad()
     def tighten(self, rig: Rig, pose: Tensor) -> None:
-        """Shrink the shell to what is visible: where the opacity's logistic is not yet saturated in any of some poses
-        (n, P), with a margin for movement. Nothing outside the old shell is evaluated, nor any frame's deformation,
-        because the shell moves with it."""
+        """Shrink the shell to what is visible in any of the given poses (n, P): where the opacity's logistic is not
+        saturated, plus a margin for movement. Only the old shell is evaluated, and no frame's deformation, because the
+        shell moves with it."""
         s, rest = self.settings, torch.zeros(1, len(rig.joints_m), 3, device=self.canonical_m.device)
         bodies = PosedBodies(rig, rest, torch.eye(4, device=rest.device)[None], self.canonical_m)
         normals = vertex_normals(bodies.vertices_m[0], rig.faces)
@@ -147,8 +147,8 @@ class FastField(Field):
         return self._sample(scene, rays, draws, None)
 
     def render_beside(self, scene: PosedScene[ShellGrid], rays: Rays, directions: Tensor) -> Tensor:
-        """Render M rays beside each ray as Field.render_beside does. What is closest to their samples is taken to first
-        order from those of the ray between them: a quarter of a pixel beside, it is the same."""
+        """Render M neighbours of each ray as Field.render_beside does. Their descriptors are derived, to first order,
+        from the closest points of the ray between them: a quarter of a pixel away, these are the same."""
         rendered = directions.new_zeros(*directions.shape[:2], 5)
         for pick, draws in self._by_samples(scene, rays):
             seen = composited(*self._sample(scene, rays.pick(pick), draws, directions[:, pick]))
@@ -158,8 +158,8 @@ class FastField(Field):
     def _sample(
         self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws, directions: Tensor | None
     ) -> tuple[RaySamples, Tensor]:
-        """Evaluate rays, or if there are directions (M, R, 3) the M R rays along them, at the depths of the rays that
-        they are close to."""
+        """Evaluate rays or, with directions (M, R, 3), the M R neighbours along these, at the depths of the rays
+        themselves."""
         depths, met, core = scene.region.sample_rays(rays, draws.jitter)
         hit = torch.nonzero(met)[:, 0]  # only these rays are evaluated; the others see nothing
         points_m = rays.pick(hit).points(depths[hit]).flatten(0, 1)
@@ -208,12 +208,12 @@ class FastField(Field):
 
     def coverage(self, samples: RaySamples) -> Tensor:
         """Return the coverage by the surface, not by the solid core that ends rays behind it; rays that start inside
-        are covered, too."""
+        also count as covered."""
         return occupancy(samples.d_hat, self.log_sharpness.exp()).amax(1)
 
     def training_samples(self, progress: float) -> int:
-        """Return half of the samples early in each phase, while surface or novel poses are still far from their final
-        state."""
+        """Return half the number of samples early in each phase, while the surface or novel poses are still far from
+        their final state."""
         return self.samples if progress >= HALF_SAMPLES_UNTIL else -(-self.samples // 2)
 
     def samples_needed(self, region: ShellGrid, rays: Rays) -> Tensor:
@@ -246,8 +246,8 @@ class FastField(Field):
 
     def _ray_colours(self, scene: PosedScene[ShellGrid], described: Descriptor, weights: Tensor, row: Tensor) -> Tensor:
         """Return the colours (R, K, 3) of samples (R K,) on rays with weights (R, K). Samples of little weight are not
-        coloured; in rendering, without gradients, there are more of them, and the coloured ones are scaled up to the
-        weight of the whole ray."""
+        coloured; in rendering, without gradients, there are more such samples, and the colours of the others are scaled
+        up to the weight of the whole ray."""
         rendering = not torch.is_grad_enabled()
         visible = shown(weights) if rendering else weights > MIN_COLOUR_WEIGHT
         colour = self._colour(scene.bodies, described, scene.conditions.pose, row, visible.flatten())
@@ -288,8 +288,8 @@ class FastField(Field):
         return outward + (found[1:] - found[0]).T / GRADIENT_STEP_M
 
     def frame_displacements(self, bodies: PosedBodies, points_m: Tensor, frame_row: Tensor) -> Tensor:
-        """Return how far rows `frame_row` (n,) move the surface next to points (N, 3) around the body at rest, (n, N,
-        3)."""
+        """Return how far the frames of rows `frame_row` (n,) move the surface next to points (N, 3) around the body at
+        rest, (n, N, 3)."""
         if self.deformation is None:
             return super().frame_displacements(bodies, points_m, frame_row)
         described = bodies.describe(points_m, frame_row.new_zeros(len(points_m)), FAR_M)
@@ -321,8 +321,8 @@ class FastField(Field):
 
 
 def least_of_limbs(d_hat: Tensor, more: Tensor) -> Tensor:
-    """Return the row of d_hat (N + M,) that is the least at each of N points: its own, or one of the last M, at points
-    `more` (M,), by other limbs. The person is the union of the limbs."""
+    """Return the row of d_hat (N + M,) with the least value at each of N points: the point's own, or one of the last M,
+    which are distances to other limbs at points `more` (M,). The person is the union of the limbs."""
     points = len(d_hat) - len(more)
     chosen = torch.arange(points, device=d_hat.device)
     own, other = d_hat.detach().split([points, len(more)])
@@ -359,13 +359,13 @@ def least_around(described: Descriptor, d_hat: Tensor) -> Tensor:
 def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     """Move samples (R K,) along their rays to where d_hat (R, K), linear between samples, is zero or closest to it.
 
-    A sample's opacity is that of the path to the next one; its colour is that of the surface that makes it opaque. If
-    the next one is nearer to another limb's surface, or the first within reach, that is the one: the sample takes the
-    place to which its successor moves on that limb, else limbs have ghosts of their outlines on the limbs behind them.
-    A limb's first sample, unless it is the ray's, also moves back, by up to the distance to the second, if it is inside
-    already. A ray's last sample stays, as do samples whose successor is out of reach. Gradients also flow through the
-    position of the zero (as in IDR, Yariv et al. 2020): a body that moves along a ray shows the same point to it, and
-    without that term it would be drawn towards or away from its camera.
+    A sample's opacity is that of the path to the next sample; its colour is that of the surface that makes this path
+    opaque. If the next sample is nearer to another limb's surface, or is the first within reach, it is that surface:
+    the sample moves to where its successor moves on that limb. Otherwise limbs would have ghosts of their outlines on
+    the limbs behind them. A limb's first sample, unless it is the first of the ray, also moves back if it is already
+    inside, by up to the distance to the second. A ray's last sample stays, as do samples whose successor is out of
+    reach. Gradients also flow through the position of the zero (as in IDR, Yariv et al. 2020): a body that moves along
+    a ray shows the same point to it, and without that term it would be drawn towards or away from its camera.
     """
     y, d, near = (t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.near))
     same_limb, ahead, after = on_same_limb(described, d_hat.shape), d_hat[:, :-1], d_hat[:, 1:]

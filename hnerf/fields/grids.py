@@ -25,7 +25,7 @@ class CanonicalField(nn.Module):
         pose_inputs: int,
         near: Callable[[Tensor, float], Tensor],
     ):
-        """Build untrained networks over a box. near: where anything is to be learned, as SparseGrids takes it."""
+        """Build untrained networks over a box. near: where there is anything to learn, as for SparseGrids."""
         super().__init__()
         width, pose_width, channels = settings.width, settings.pose_width, settings.channels
         self.unit_m = settings.outer_m
@@ -70,8 +70,8 @@ class CanonicalField(nn.Module):
     def _hidden(
         self, first: nn.Module, features: Tensor, d_m: Tensor, pose: Tensor, row: Tensor, *more: Tensor
     ) -> Tensor:
-        """Return what the first layer of a network makes of features, d, the code of the pose and whatever else it is
-        given. A single pose is part of its bias, in nine tenths of the time."""
+        """Return the output of a network's first layer for features, d, the pose code and any further inputs. A single
+        pose is folded into the bias, which takes nine tenths of the time."""
         code, inputs = self.pose_code(pose), [features, d_m[:, None] / self.unit_m]
         if len(code) > 1:
             hidden: Tensor = first(torch.cat([*inputs, code.index_select(0, row), *more], -1))

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from hnerf.fields.encoding import positional_encoding
 
-MULTIPLE = 8  # of a matrix's rows in bfloat16: tensor cores take other sizes at a fraction of their speed
+MULTIPLE = 8  # of a matrix's rows in bfloat16: tensor cores process other sizes at a fraction of their speed
 
 
 class SkipMLP(nn.Module):
@@ -34,8 +34,8 @@ class SkipMLP(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(size, width) for size in sizes)
 
     def init_kaiming(self) -> None:
-        """Initialise weights as He et al. (2015), biases zero: torch's default leaves the output of eight layers nearly
-        constant over space."""
+        """Initialise weights as in He et al. (2015), biases to zero: torch's default leaves the output of eight layers
+        nearly constant over space."""
         for layer in self.layers:
             assert isinstance(layer, nn.Linear)
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")

@@ -33,7 +33,7 @@ class PaperField(Field):
 
     @classmethod
     def build(cls, body: BodyFit, settings: PaperFieldSettings, static: bool) -> "PaperField":
-        """Return an untrained field, in the paper's static form where there is one training frame."""
+        """Return an untrained field, in the paper's static form if there is one training frame."""
         return cls(body.rig, body.root, settings, static)
 
     def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
@@ -58,15 +58,15 @@ class PaperField(Field):
         return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
     def compile_networks(self) -> None:
-        """Compile F, but not DH: torch does not compile the second derivatives that `eikonal` needs. Where compilation
-        fails, as without Python's headers, torch warns and runs F as it is."""
+        """Compile F, but not DH: torch does not compile the second derivatives that `eikonal` needs. If compilation
+        fails, for example without Python's headers, torch warns and runs F uncompiled."""
         torch._dynamo.config.suppress_errors = True
         self.radiance.compile(dynamic=True)
 
     def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples)."""
         box, half_m, inner = scene.region, self.settings.scene_m, self.settings.box_samples
-        # a person who walks out of the scene takes it along
+        # the scene grows to hold a person who walks out of it
         lower_m = torch.minimum(self.centre_m - half_m, box.lower_m[rays.frame])
         upper_m = torch.maximum(self.centre_m + half_m, box.upper_m[rays.frame])
         near, far = box_interval(rays, lower_m, upper_m)
@@ -128,8 +128,8 @@ class PaperField(Field):
     def _radiance(
         self, points_m: Tensor, described: Descriptor, pick: Tensor, row: Tensor, view: Tensor, conditions: Conditions
     ) -> tuple[Tensor, Tensor]:
-        """Return density and colour. Outside the box the input is x with a constant distance, and neither pose nor root
-        counts. The root's translation is from the middle of the scene."""
+        """Return density and colour. Outside the box the input is x with a constant distance, and pose and root are
+        zero. The root's translation is relative to the scene's centre."""
         scaled = self._scaled(points_m)
         if self.static:
             return self.radiance(scaled, conditions.pose[row, :0], conditions.root[row, :0], view)
@@ -164,8 +164,8 @@ def sample_pdf(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, unif
     """Draw depths (R, K) from piecewise constant weights (R, K) by inverse transform sampling (Mildenhall et al. 2020,
     section 5.2).
 
-    middles (R, K): the samples of these weights; their cells meet half-way between samples. uniform (R, K) in [0, 1):
-    position in each stratum.
+    middles (R, K): the samples that have these weights; their cells meet half-way between samples. uniform (R, K) in
+    [0, 1): position in each stratum.
     """
     edges = torch.cat([near[:, None], (middles[:, 1:] + middles[:, :-1]) / 2, far[:, None]], 1)
     cumulative = torch.cat([torch.zeros_like(near)[:, None], (weights + 1e-5).cumsum(1)], 1)

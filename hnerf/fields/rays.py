@@ -37,8 +37,8 @@ class Rays:
 
 @dataclass(frozen=True)
 class PosedScene(Generic[Region]):
-    """What rays are evaluated in, by body row: the posed bodies, the field's sampling region around them and its
-    conditions. correction: the change of poses and shape that is being learned; None in rendering."""
+    """The scene in which rays are evaluated, by body row: the posed bodies, the field's sampling region around them and
+    its conditions. correction: the change of poses and shape that is being learned; None in rendering."""
 
     bodies: PosedBodies
     region: Region

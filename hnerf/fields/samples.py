@@ -10,7 +10,7 @@ from torch import Tensor
 class RaySamples:
     """A field evaluated along a batch of rays.
 
-    alpha of the radiance field, alpha_dot of the SDF, in_box b, d of the body, residual dd. density: None where the SDF
+    alpha of the radiance field, alpha_dot of the SDF, in_box b, d of the body, residual dd. density: None if the SDF
     itself is the density. gradient_norm: |grad d_hat| at some or all samples. background: the colour behind the
     samples. elastic: deformation energy of the rays that have one, None without a deformation.
     """

@@ -16,7 +16,7 @@ from hnerf.fields.rays import Rays
 from hnerf.warp_import import wp
 
 EMPTY, SHELL, SOLID = 0, 1, 2
-SLACK = 0.5  # cells: most of a cell then lies in the shell; thicknesses have more room than its corners need
+SLACK = 0.5  # cells: most of a cell then lies in the shell; thicknesses leave more room than its corners need
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class ShellGrid:
         """Build the shell around closed surfaces with vertices (n, V, 3); outer_m, inner_m (n, V): thickness in metres
         outside and inside; points: dense surface points, as `surface_points` returns them.
 
-        Each surface point's cell reaches as far as the point is thick and half a cell farther, between cell centres, so
-        the shell is up to a cell thicker or thinner than asked.
+        From each surface point's cell the shell extends by the thickness there plus half a cell, measured between cell
+        centres, so it is up to a cell thicker or thinner than requested.
         """
         wp.init()
         corners, weights = points
@@ -57,8 +57,8 @@ class ShellGrid:
         return ShellGrid(cells, lower, cell_m)
 
     def cell_states(self, rays: Rays, depths_m: Tensor) -> Tensor:
-        """Return the state of the cells at depths (R, K) along R rays: (R, K) uint8. Outside the grid it is that of the
-        outermost cells, which are EMPTY."""
+        """Return the state of the cells at depths (R, K) along R rays: (R, K) uint8. Outside the grid, the state is
+        that of the outermost cells, which are EMPTY."""
         origins = (rays.origins_m - self.lower_m[rays.frame]) / self.cell_m
         directions = rays.directions / self.cell_m
         flat = rays.frame[:, None].to(torch.int32 if self.cells.numel() < 2**31 else torch.int64)
@@ -74,7 +74,7 @@ class ShellGrid:
         edges, cumulative, ends = self._march(rays)
         samples = jitter.shape[1]
         strata = torch.arange(samples, device=edges.device, dtype=edges.dtype)
-        share = ((strata + jitter) / samples).clamp(max=1 - 2**-24)  # below 1, which rounding would reach now and then
+        share = ((strata + jitter) / samples).clamp(max=1 - 2**-24)  # below 1, which rounding would occasionally reach
         wanted = share * cumulative[:, -1:]
         upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
         inside = wanted - cumulative.gather(1, upper - 1)
@@ -91,7 +91,7 @@ class ShellGrid:
         size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=lower_m.device)
         near, far = box_interval(rays, lower_m, lower_m + size_m)
         bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
-        edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # the same for any batch
+        edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # independent of the batch
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
         state = self.cell_states(rays, middles)
         deepest = state.cummax(1).values  # EMPTY < SHELL < SOLID

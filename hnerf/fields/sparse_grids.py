@@ -1,5 +1,5 @@
-"""Feature grids that hold only the nodes near a surface, about a fifth of all; their levels are interpolated and
-differentiated in one pass each by warp."""
+"""Feature grids that hold only the nodes near a surface, about a fifth of all. All levels are interpolated in one pass,
+and differentiated in another, by warp."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -17,8 +17,8 @@ class SparseGrids(nn.Module):
     """Learned features at the nodes of several grids over a box, trilinearly interpolated and concatenated; they start
     at zero, and are zero at nodes that are not kept.
 
-    features (M, channels): of the kept nodes of all levels; rows (nodes,) int32: which of them belongs to a node, -1 to
-    none; x runs fastest, then y, z and level. sizes (levels, 3) int32: nodes of each level along x, y, z.
+    features (M, channels): of the kept nodes of all levels; rows (nodes,) int32: the row of each node in features, -1
+    if it is not kept; x runs fastest, then y, z and level. sizes (levels, 3) int32: nodes of each level along x, y, z.
     """
 
     lower_m: Tensor
@@ -34,8 +34,8 @@ class SparseGrids(nn.Module):
         channels: int,
         near: Callable[[Tensor, float], Tensor],
     ):
-        """Build grids of `cells` along the box's longest side, one for each number. near: maps points (N, 3) and a
-        distance in metres to whether anything is to be learned that near to each, (N,) bool."""
+        """Build one grid for each number in `cells`: its cells along the box's longest side. near: maps points (N, 3)
+        and a distance in metres to whether there is anything to learn within that distance of each, (N,) bool."""
         super().__init__()
         wp.init()
         size_m = upper_m - lower_m
@@ -44,7 +44,7 @@ class SparseGrids(nn.Module):
             count = (size_m / size_m.max() * n).round().int().clamp(min=1) + 1
             z, y, x = (torch.linspace(0, 1, int(k), device=size_m.device) for k in count.flip(0))
             nodes = torch.cartesian_prod(z, y, x).flip(1) * size_m + lower_m
-            kept.append(near(nodes, float((size_m / (count - 1)).norm())))  # all corners of a cell with samples in it
+            kept.append(near(nodes, float((size_m / (count - 1)).norm())))  # keeps all corners of a cell with samples
             sizes.append(count)
         keep = torch.cat(kept)
         self.register_buffer("lower_m", lower_m.clone())
@@ -93,7 +93,8 @@ class _Interpolation(torch.autograd.Function):
 
 
 def _launch(which: int, common: tuple[Tensor, ...], nodes: list[Tensor], of_unit: Tensor | None = None) -> None:
-    """Run a kernel of `_kernels` over N points; `nodes` and `of_unit` are its arguments beside the common ones."""
+    """Run a kernel of `_kernels` over N points; `nodes` and `of_unit` are its arguments in addition to the common
+    ones."""
     unit, features, sizes, rows = common
     if not len(unit):
         return
@@ -115,7 +116,7 @@ def _launch(which: int, common: tuple[Tensor, ...], nodes: list[Tensor], of_unit
 
 @wp.func
 def _lowest_node(at: wp.vec3, size: wp.vec3i):
-    """Return the node with the least coordinates of the cell at fractional coordinates."""
+    """Return the node with the least coordinates in the cell that contains fractional coordinates."""
     last = size - wp.vec3i(2, 2, 2)  # type: ignore[operator]
     return wp.min(wp.vec3i(int(at[0]), int(at[1]), int(at[2])), last)
 
@@ -128,8 +129,9 @@ def _share(far: int, fraction: float):
 
 @cache
 def _kernels(channels: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Return two kernels over points (N,) in the unit cube: interpolation, and its gradients by the features, added to
-    those that are there, and, if wanted, by the points. starts (levels,): the first node of each level."""
+    """Return two kernels over points (N,) in the unit cube: interpolation, and its gradients with respect to the
+    features, added to existing ones, and, if requested, to the points. starts (levels,): the first node of each
+    level."""
     Node = wp.types.vector(length=channels, dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
