@@ -39,7 +39,8 @@ def quality_chart(history: list[dict[str, Any]], path: Path) -> bool:
 
 
 def frame_chart(per_image: list[ImageScores], path: Path) -> bool:
-    """Draw the PSNR of every frame, one line a camera. Return whether an image was scored and the file was written."""
+    """Draw the PSNR of every frame, one line per camera. Return whether an image was scored and the file was
+    written."""
     series: dict[str, Points] = defaultdict(list)
     for score in per_image:
         series[f"camera {score['camera']}"].append((score["frame"], score["psnr"]))
@@ -84,7 +85,7 @@ def _finish(axes: Axes, x_label: str, y_label: str) -> None:
 
 
 def style(axes: Axes, x_label: str, y_label: str) -> None:
-    """Set the labels, and the style that all charts share."""
+    """Set the labels and the style that all charts share."""
     axes.set_xlabel(x_label, color=INK)
     axes.set_ylabel(y_label, color=INK)
     axes.grid(color=FAINT, linewidth=0.7)

@@ -24,7 +24,7 @@ def avatar_for_split(split: str, avatar: Avatar, fitted: BodyFit) -> Avatar:
 
 
 def reason_unavailable(split: str, training: Path) -> str | None:
-    """Return why a trained model, by its folder, has nothing of its own to show for a split; None if it has."""
+    """Return why a trained model, by its folder, has nothing of its own to show for a split; None if it does."""
     reason = reason_without_novel_poses(training) if split in NOVEL_POSE_SPLITS else None
     if reason or split not in (POSED, TRACKED):
         return reason

@@ -60,7 +60,7 @@ PROTOCOL = (
 def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) -> Metrics:
     """Write `renders/`, `meshes/`, `metrics.json`, charts and `report.html` into `out`; return what metrics.json holds.
 
-    A score that is not available is null, with a reason beside it.
+    A score that is not available is null, with a reason next to it.
     """
     started = time.perf_counter()
     capture = inputs.capture
@@ -94,7 +94,7 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
 
 
 def protocol_of(truth: GroundTruth) -> str:
-    """Return the protocol, with what differs for captures without true masks."""
+    """Return the protocol, including what differs for captures without true masks."""
     given = isinstance(truth, GivenMasks)
     return f"{PROTOCOL} Here, images are compared to {UNDER_GIVEN_MASKS}." if given else PROTOCOL
 
@@ -109,7 +109,7 @@ def score_meshes(
     avatar: Avatar, frames: list[int], true_meshes: dict[int, trimesh.Trimesh], out: Path
 ) -> dict[str, Any]:
     """Write `meshes/<frame>.ply` of the frames, posed as the avatar's body is; return their mean geometry scores, or
-    null with a reason, which is why there is no surface if any frame has none."""
+    null with a reason. If any frame has no surface, the reason says why."""
     (out / "meshes").mkdir(exist_ok=True)
 
     def measure(frame: int) -> tuple[int, dict[str, Any] | None]:
@@ -135,6 +135,6 @@ def score_meshes(
 
 
 def reason_without_surface(scores: Mapping[str, Any]) -> str | None:
-    """Return why the field that a split's scores are of has no surface; None if it has one or none was extracted."""
+    """Return why the field that a split's scores belong to has no surface; None if it has one or none was extracted."""
     reason = scores.get("geometry_reason", "")
     return reason if reason.startswith(NO_SURFACE) else None

@@ -1,4 +1,4 @@
-"""Rows of pictures for the report: the photograph, what was reconstructed from it, and the error."""
+"""Rows of images for the report: the photograph, what was reconstructed from it, and the error."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from hnerf.geometry.mesh_queries import Surface
 
 @dataclass(frozen=True)
 class GalleryPicture:
-    """A captioned picture as a data URI."""
+    """A captioned image as a data URI."""
 
     caption: str
     uri: str
@@ -26,7 +26,7 @@ class GalleryPicture:
 
 @dataclass(frozen=True)
 class Row:
-    """The pictures of one view or frame."""
+    """The images of one view or frame."""
 
     title: str
     note: str
@@ -80,7 +80,7 @@ def view_row(
 def _mask_and_reference(
     view: View, image: np.ndarray, inputs: EvaluationInputs, truth: GroundTruth | None
 ) -> tuple[np.ndarray | None, tuple[str, np.ndarray] | None]:
-    """Return the mask (H, W) bool and the captioned picture to compare with, or None where there is none."""
+    """Return the mask (H, W) bool and the captioned image to compare with, each None if there is none."""
     if view.split != TRAINING_VIEW and truth is not None and truth.has_mask(view.camera, view.frame):
         picture, source = truth.on_black(view.camera, view.frame)
         caption = "Input × mask" if source == GIVEN_MASKED_IMAGE else "Ground truth"
@@ -92,8 +92,8 @@ def _mask_and_reference(
 
 
 def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None, root: np.ndarray, note: str) -> Row:
-    """Return a mesh's row: the mesh from the person's front and back, beside it the true one and the distance between
-    them. root (4, 4)."""
+    """Return a mesh's row: the mesh from the person's front and back, followed by the true mesh and the distance
+    between them. root (4, 4)."""
     points_m = mesh.vertices if truth is None else np.concatenate([mesh.vertices, truth.vertices])
     cameras = {side: pictures.portrait_camera(points_m, root, side) for side in ("front", "back")}
     surface = Surface(mesh)

@@ -38,7 +38,7 @@ class GroundTruth:
         return any(self.has_mask(c, f) for c in self.capture.test_cameras for f in self.capture.frames)
 
     def has_mask(self, camera: str, frame: int) -> bool:
-        """Return whether this image has a true mask: there may be a few drawn by hand."""
+        """Return whether this image has a true mask: there may be only a few, drawn by hand."""
         return self._mask_path(camera, frame).exists()
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
@@ -67,7 +67,7 @@ class GroundTruth:
             faces, vertices, frames = stored["faces"], stored["vertices"], stored["frames"]
             if vertices.shape[2:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
                 raise ValueError("vertices are not (frames, V, 3), or faces not integers (F, 3)")
-            near = vertices.min() >= -MAX_M and vertices.max() <= MAX_M  # which NaN is not
+            near = vertices.min() >= -MAX_M and vertices.max() <= MAX_M  # False for NaN
             if not (near and faces.min() >= 0 and faces.max() < vertices.shape[1]):
                 raise ValueError(f"a face index is out of range, or a vertex is not within {MAX_M} m")
             return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
@@ -83,9 +83,9 @@ class GroundTruth:
         return self._path("masks", camera, f"{self.capture.recorded_frame(camera, frame):06d}.png")
 
     def _as_rendered(self, image: np.ndarray, camera: str, path: Path) -> np.ndarray:
-        """Undistort and shrink an image of the recording's size, as ingest does with photographs; return one of the
-        camera's size as it is. Where no lens distorts, any other size of the same shape is resized. Raises InputError
-        otherwise."""
+        """Undistort and shrink an image of the recording's size, as ingest does with photographs; return an image of
+        the camera's size unchanged. If no lens distorts, an image of another size but the same aspect ratio is resized.
+        Raises InputError otherwise."""
         size = self.capture.cameras[camera].size_px
         recorded_px = self.capture.recorded_sizes_px.get(camera)
         if camera in self.capture.recorded_lenses and image.shape[1::-1] == recorded_px:
@@ -104,8 +104,8 @@ class GroundTruth:
 
 
 class GivenMasks(GroundTruth):
-    """The Truth of captures whose test cameras have no true masks but some that came with the recording: photographs
-    under these, with everybody whom they show. Surfaces are still those of `ground_truth/`."""
+    """The Truth of captures whose test cameras have no true masks, but masks that came with the recording: photographs
+    under those masks, with everybody they show. Surfaces are still those of `ground_truth/`."""
 
     def has_mask(self, camera: str, frame: int) -> bool:
         """Return whether a mask of this image came with the recording."""
@@ -131,7 +131,7 @@ def truth_of(folder: Path, capture: Capture) -> GroundTruth:
 
 @dataclass(frozen=True)
 class OwnMasks:
-    """The Truth of captures that have none: the person under the masks from segmentation."""
+    """The Truth of captures without ground truth: the person under the masks from segmentation."""
 
     capture: Capture
     masks: Masks

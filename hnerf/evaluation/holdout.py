@@ -1,4 +1,5 @@
-"""Scores of captures without test cameras: fields trained without a camera, against its photographs."""
+"""Scores of captures without test cameras: fields trained without one camera, compared with that camera's
+photographs."""
 
 import dataclasses
 import json

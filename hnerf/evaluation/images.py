@@ -25,7 +25,7 @@ TUNED_ON = (
 
 
 def scored_views(capture: Capture, split: str, truth: Truth, count: int | None) -> list[View]:
-    """Return all images of a split, or at most `count` of those with a true mask; of all if none has one."""
+    """Return all images of a split, or at most `count` of those with a true mask (of all, if none has one)."""
     views = all_views(capture, split)
     if count is None:
         return views

@@ -15,7 +15,7 @@ class EvaluationInputs:
 
     capture_folder: as recorded, for its ground_truth/; capture: with the calibrated cameras; fitted: the body before
     training (avatar.body holds the fine-tuned one); the folders hold their stages' report.json; held_out_folders:
-    output of `score_held_out`, one a camera; fit_seconds: of each part of the fit.
+    output of `score_held_out`, one per camera; fit_seconds: of each part of the fit.
     """
 
     capture_folder: Path

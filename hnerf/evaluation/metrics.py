@@ -22,7 +22,7 @@ def score_image(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray) -
 
 
 def trivial_psnr(reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """Return the PSNR of trivial pictures: a black one, and one colour, the person's mean, inside the true mask."""
+    """Return the PSNR of trivial images: all black, and the person's mean colour inside the true mask."""
     box = mask_box(mask)
     truth = reference[box].astype(np.float32) / 255
     one_colour = mask[box][..., None] * truth[mask[box]].mean(0)

@@ -1,4 +1,4 @@
-"""Pictures for the report: masks, overlays, error maps and shaded surfaces, all (H, W, 3) uint8 RGB."""
+"""Images for the report: masks, overlays, error maps and shaded surfaces, all (H, W, 3) uint8 RGB."""
 
 import base64
 import dataclasses
@@ -13,32 +13,32 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.rays import RayHits
 
-PICTURE_PX = (300, 400)  # width, height of a picture in the report
+PICTURE_PX = (300, 400)  # width, height of an image in the report
 SUPERSAMPLING = 2
 ACCENT = np.array([255, 122, 26], np.float32)  # orange: rare in clothes, visible on any background
 BACKGROUND = np.array([255, 255, 255], np.float32)
 KEY_LIGHT = np.array([-0.40, -0.56, -0.72])  # towards the light in camera axes: from above left, behind the camera
 FULL_ERROR = 0.25  # difference, in a range of 1, that the error map shows brightest
 FULL_DISTANCE_M = 0.03  # distance that the surface map shows darkest
-# At equal steps of distance.
+# Colours at equal steps of distance.
 DISTANCE_COLOURS = np.array([[214, 208, 200], [247, 190, 90], [222, 84, 44], [112, 10, 40]], np.float32)
 
 
 def data_uri(picture: np.ndarray) -> str:
-    """Encode a picture as a JPEG data URI."""
+    """Encode an image as a JPEG data URI."""
     encoded, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
     assert encoded
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
 
 
 def shrunk(picture: np.ndarray, longest_px: int) -> np.ndarray:
-    """Return a picture with its longer side at most `longest_px`."""
+    """Return an image, shrunk if its longer side exceeds `longest_px`."""
     scale = longest_px / max(picture.shape[:2])
     return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
 
 
 def frame_person(person: np.ndarray) -> tuple[slice, slice]:
-    """Return rows and columns around a person (H, W) bool, as close to a report picture's aspect ratio as the image
+    """Return rows and columns around a person (H, W) bool, as close to the aspect ratio of PICTURE_PX as the image
     allows."""
     image_height, image_width = person.shape
     box = mask_box(person if person.any() else np.ones_like(person))
@@ -59,7 +59,7 @@ def _widened(part: range, length: int, limit: int) -> slice:
 
 
 def crop(picture: np.ndarray, box: tuple[slice, slice]) -> np.ndarray:
-    """Return the box of a picture, scaled to the height of report pictures."""
+    """Return the box of an image, scaled to the height of images in the report."""
     part = picture[box]
     height, width = part.shape[:2]
     method = cv2.INTER_CUBIC if height < PICTURE_PX[1] else cv2.INTER_AREA
@@ -107,8 +107,8 @@ def error_map(rendered: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Shot:
-    """A surface as a camera's picture shows it, in one look or another: the camera with SUPERSAMPLING times the pixels
-    along each side, and the hits of their rays, row by row."""
+    """A surface as a camera sees it, to be drawn in one style or another. fine: the camera with SUPERSAMPLING times the
+    pixels along each side; hits: those of its pixels' rays, row by row."""
 
     mesh: trimesh.Trimesh
     camera: Camera
@@ -116,14 +116,14 @@ class Shot:
     hits: RayHits
 
     def averaged(self, colours: np.ndarray) -> np.ndarray:
-        """Return the picture (H, W, 3) uint8 of the rays' colours (N, 3), 0 to 255, on white."""
+        """Return the image (H, W, 3) uint8 of the rays' colours (N, 3), 0 to 255, on white."""
         fine = np.where(self.hits.face[:, None] >= 0, colours, BACKGROUND).astype(np.float32)
         fine = fine.reshape(self.fine.height_px, self.fine.width_px, 3)
         return cv2.resize(fine, self.camera.size_px, interpolation=cv2.INTER_AREA).clip(0, 255).astype(np.uint8)
 
 
 def shoot(surface: Surface, camera: Camera) -> Shot:
-    """Cast the rays of a camera's picture."""
+    """Cast the rays of a camera's supersampled image."""
     fine = supersampled(camera)
     return Shot(surface.mesh, camera, fine, cast_pixels(surface, fine))
 

@@ -108,7 +108,8 @@ def write_report(
 
 
 def report_environment(*folders: Path) -> jinja2.Environment:
-    """Return the environment of pages that look like the report; folders: of templates beside the report's own."""
+    """Return the environment of pages that look like the report; folders: of templates in addition to the report's
+    own."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([*folders, TEMPLATES]),
         autoescape=True,
@@ -260,7 +261,7 @@ def png_uri(path: Path) -> str:
 
 
 def costs(stages: dict[str, dict[str, Any]], found: Metrics) -> list[tuple[str, str]]:
-    """Return what the run cost: seconds of each stage and its parts where recorded, memory, model size, time of one
+    """Return what the run cost: seconds of each stage and of its parts if recorded, memory, model size, time of one
     image."""
     rows = []
     for name, report in (stages | {"Evaluation": found}).items():
@@ -274,7 +275,7 @@ def costs(stages: dict[str, dict[str, Any]], found: Metrics) -> list[tuple[str, 
 
 
 def reading_notes(inputs: EvaluationInputs, found: Metrics) -> list[str]:
-    """Return what is missing from the scores, or must be kept in mind when they are read."""
+    """Return notes on what is missing from the scores, or must be kept in mind when reading them."""
     lines = [f"LPIPS is {found['lpips']}.", *missing_figures(found), *under_given_masks(found)]
     for split in PRIMARY_SPLITS:
         scores, title = found[split], SPLIT_TITLES[split]

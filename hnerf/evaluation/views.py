@@ -27,7 +27,7 @@ class View:
     frame: int
 
     def path(self, out: Path) -> Path:
-        """Return the path of its rendering below the evaluation folder."""
+        """Return the path of the view's rendering in the evaluation folder."""
         return out / "renders" / self.split / self.camera / f"{self.frame:06d}.png"
 
 

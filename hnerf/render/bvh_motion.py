@@ -19,12 +19,12 @@ from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 LIMBS = ("thigh", "calf", "foot", "upperarm", "forearm", "hand")
 NEEDED = (PELVIS, *(f"{limb}_{side}" for side in "LR" for limb in LIMBS))
 ENDS = {"upperarm": "forearm", "forearm": "hand", "thigh": "calf", "calf": "foot"}  # of limbs whose rest poses differ
-AT_REST = {name for name in EQUIVALENTS if is_serial(name) or name.startswith(FINGERS)}  # whatever a file says of them
+AT_REST = {name for name in EQUIVALENTS if is_serial(name) or name.startswith(FINGERS)}  # whatever files say
 PREFIX = re.compile(r".*:|mixamorig\d*_?")
 
 
 def bvh_motion(path: Path) -> tuple[BodyFit, float]:
-    """Read a BVH file as poses of anny's average body in a world with Y up; return them and their frames a second.
+    """Read a BVH file as poses of anny's average body in a world with Y up; return them and their frame rate.
 
     Joints are found by their names in one of the skeletons of hnerf/body/skeletons.py. Raises InputError if joints are
     missing, or `read_bvh` does.
@@ -35,10 +35,10 @@ def bvh_motion(path: Path) -> tuple[BodyFit, float]:
 
 
 def retargeted(path: Path, file: Bvh, rig: Rig) -> BodyFit:
-    """Return a file's poses on a rig. Lengths are scaled by those of the legs.
+    """Return a file's poses on a rig. Lengths are scaled by the ratio of leg lengths.
 
-    A joint turns in the world as the file's does, from the rig's rest pose turned so that its limbs point as the file's
-    do at rest, by the shortest way. Joints that the file lacks, and those that are not free, keep their rest.
+    The rig's limbs are first turned, by the shortest rotation, to point as the file's do at rest; from there, each
+    joint turns in the world as the file's does. Joints that the file lacks, and those that are not free, stay at rest.
     """
     joints = joints_by_name(path, file.names)
     upright = _upright(path, file, joints)
@@ -68,9 +68,9 @@ def retargeted(path: Path, file: Bvh, rig: Rig) -> BodyFit:
 
 
 def joints_by_name(path: Path, names: tuple[str, ...]) -> dict[str, int]:
-    """Return which of a file's joints each exported name is, in the skeleton that has most of the file's names. Joints
-    that stay at rest do not count: CMU's fingers are named like HumanIK's, its trunk is not. Raises InputError if hips,
-    arms or legs are missing."""
+    """Return the index of a file's joint for each exported name, by the skeleton that shares most names with the file.
+    Joints that stay at rest do not count: CMU's fingers are named like HumanIK's, its trunk is not. Raises InputError
+    if hips, arms or legs are missing."""
     plain = {PREFIX.sub("", name).lower(): j for j, name in reversed(list(enumerate(names)))}
     tables = [{name: name for name in EQUIVALENTS}, *map(exported_from, SKELETONS)]
     found = [{ours: plain[t.lower()] for t, ours in table.items() if t.lower() in plain} for table in tables]
@@ -85,7 +85,7 @@ def joints_by_name(path: Path, names: tuple[str, ...]) -> dict[str, int]:
 
 
 def _upright(path: Path, file: Bvh, joints: dict[str, int]) -> np.ndarray:
-    """Return the rotation (3, 3) from the file's axes to Y up with the rest pose facing +Z. Raises InputError where the
+    """Return the rotation (3, 3) from the file's axes to Y up with the rest pose facing +Z. Raises InputError if the
     rest pose does not stand along Y or Z, or a limb has no direction."""
     rest = file.rest()
     for start, end in ((f"{start}_{side}", f"{end}_{side}") for start, end in ENDS.items() for side in "LR"):
@@ -107,8 +107,8 @@ def _upright(path: Path, file: Bvh, joints: dict[str, int]) -> np.ndarray:
 def _to_rest_of_file(
     name: str, joints: dict[str, int], rest: np.ndarray, own: dict[str, int], places: np.ndarray
 ) -> np.ndarray:
-    """Return the rotation (3, 3) that turns a limb of the rig at rest to where the file's points at rest; a hand's is
-    that of its forearm."""
+    """Return the rotation (3, 3) that turns a limb of the rig at rest to where the file's points at rest; a hand takes
+    its forearm's."""
     limb, _, side = name.partition("_")
     limb = "forearm" if limb == "hand" else limb
     if limb not in ENDS or side not in ("L", "R"):
@@ -119,7 +119,7 @@ def _to_rest_of_file(
 
 
 def _above(rig: Rig, joint: int, known: dict[str, np.ndarray]) -> str:
-    """Return the exported name of the nearest joint above that is known; the pelvis is."""
+    """Return the exported name of the nearest joint above that is known; the pelvis always is."""
     while True:
         joint = int(rig.parents[joint])
         name = exported_name(rig.joint_names[joint])

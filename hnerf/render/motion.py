@@ -31,7 +31,7 @@ AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
 HIPS = ("upperleg01.L", "upperleg01.R")
 DEFAULT_FPS = 30.0  # of AMASS files without a rate
-BELOW_FLOOR = 0.05  # share of a motion's frames with a foot below its floor, by errors
+BELOW_FLOOR = 0.05  # share of a motion's frames with a foot below its floor, due to errors
 MAX_MOTION_BYTES = 256_000_000  # unpacked; half an hour of SMPL-H at 100 poses a second
 
 
@@ -85,7 +85,7 @@ def select_frames(frames: tuple[int, ...], wanted: str, source: Path) -> tuple[i
 
 def select_poses(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
     """Return the body with the poses of these frames only."""
-    rows = {frame: row for row, frame in enumerate(body.frames)}  # `body.index` would look through all for each
+    rows = {frame: row for row, frame in enumerate(body.frames)}  # `body.index` would search all frames for each
     chosen = [rows[frame] for frame in frames]
     return dataclasses.replace(body, frames=frames, theta=body.theta[chosen], root=body.root[chosen])
 
@@ -93,11 +93,11 @@ def select_poses(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
 def retarget(own: BodyFit, motion: Motion, up: str, source: object = "motion") -> BodyFit:
     """Return the motion's poses on the rig of `own`, with the rotations of joints matched by name.
 
-    The middle of the hips goes the way that it goes on the motion's own body, unscaled, so that legs which stand keep
-    standing while the trunk bends. It is moved so that its mean position coincides with that of `own`, and the motion's
-    floor, which 5 % of its frames reach below, with that of `own`, the median of its lowest points, on which the asset
-    stands. In each frame the lowest point keeps the height above the floor that it had on the motion's own body. `up`:
-    the vertical axis of the world of `own`. Raises InputError, naming `source`, if the motion lacks a joint.
+    The middle of the hips follows its path on the motion's own body, unscaled, so that standing legs keep standing
+    while the trunk bends. The path is shifted so that its mean position coincides with that of `own`. The motion's
+    floor, which 5 % of its frames reach below, is put on that of `own`: the median of its lowest points, on which the
+    asset stands. In each frame the lowest point keeps the height above the floor that it had on the motion's own body.
+    `up`: the vertical axis of the world of `own`. Raises InputError, naming `source`, if the motion lacks a joint.
     """
     other, names = motion.body, motion.body.rig.joint_names
     theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
@@ -112,7 +112,7 @@ def retarget(own: BodyFit, motion: Motion, up: str, source: object = "motion") -
     hips_m = middle_of_hips_m(other) @ turn[:3, :3].T
     placed = set_middle_of_hips(placed, hips_m + middle_of_hips_m(own).mean(0) - hips_m.mean(0))
     lowest_m = lowest_points_m(other, motion.up)
-    above_floor_m = lowest_m - lowest_m.quantile(BELOW_FLOOR)  # of a motion that may be in the air half of the time
+    above_floor_m = lowest_m - lowest_m.quantile(BELOW_FLOOR)  # the motion may be in the air half of the time
     return set_lowest_points(placed, above_floor_m + lowest_points_m(own, up).quantile(0.5), up)
 
 
@@ -140,8 +140,8 @@ def middle_of_hips_m(body: BodyFit) -> Tensor:
 def set_middle_of_hips(body: BodyFit, points_m: Tensor) -> BodyFit:
     """Return the same poses, translated so that the middle of the hip joints is at `points_m` (n, 3).
 
-    Rigs have it at different places in the body frame: about that frame's origin, hips and standing feet would slide
-    while the trunk bends.
+    Its place in the body frame differs between rigs: if that frame's origin were matched instead, hips and standing
+    feet would slide while the trunk bends.
     """
     return _translated(body, points_m - middle_of_hips_m(body))
 

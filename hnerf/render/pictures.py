@@ -97,7 +97,7 @@ def depth_image(rendering: Rendering, camera: Camera) -> Tensor:
 def normal_image(avatar: Avatar, rendering: Rendering, camera: Camera, theta: Tensor, root: Tensor) -> Tensor:
     """Return surface normals as an image (H, W, 3) uint8, encoded as in `write_pictures`: the gradient of the signed
     distance where rays end."""
-    covered = (rendering.alpha > COVERED) & (rendering.depth_m > 0)  # a mixed pixel's centre may pass the person
+    covered = (rendering.alpha > COVERED) & (rendering.depth_m > 0)  # a mixed pixel's centre may miss the person
     origins, directions = (torch.from_numpy(a.copy()).to(rendering.depth_m) for a in camera.rays(camera.pixels_px))
     points_m = origins[covered] + rendering.depth_m[covered][:, None] * directions[covered]
     normals, _ = normals_and_distances(avatar, points_m, theta, root, NORMAL_STEP_M)

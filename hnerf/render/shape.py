@@ -20,8 +20,7 @@ UNSCALED_PARTS = "neck", "wrist", "foot"
 
 
 def with_shape_values(rig: Rig, changes: Mapping[str, float]) -> Rig:
-    """Return the rig with these amounts added to its shape values of these names, to first order around the fitted
-    shape.
+    """Return the rig with the named shape values changed by these amounts, to first order around the fitted shape.
 
     Raises InputError if the rig has no such value, or if the skin would fold over.
     """
@@ -55,7 +54,7 @@ def with_volume(rig: Rig, change: float) -> Rig:
 
 
 def offsets_from_bones_m(rig: Rig) -> Tensor:
-    """Return the offset (V, 3) in metres from the nearest points of the bones that carry a vertex to it, blended by its
+    """Return each vertex's offset (V, 3) in metres from the nearest points on the bones that carry it, blended by its
     skin weights; zero on head, hands and feet. A bone reaches from its joint to the joint's children."""
     moved_m, parents, stays = torch.zeros_like(rig.vertices_m), rig.parents.tolist(), set()
     for joint, parent in enumerate(parents):
@@ -79,8 +78,8 @@ def volume_m3(rig: Rig) -> float:
 
 
 def transfer_poses(rig: Rig, body: BodyFit, up: str) -> BodyFit:
-    """Return the poses of `body` on a reshaped rig: the hips stay where they are, save that each pose's lowest point is
-    to be as high as before along the world's axis `up`."""
+    """Return the poses of `body` on a reshaped rig: the hips stay where they are, except that each pose is shifted
+    along the world's axis `up` so that its lowest point is as high as before."""
     reshaped = set_middle_of_hips(dataclasses.replace(body, rig=rig), middle_of_hips_m(body))
     return set_lowest_points(reshaped, lowest_points_m(body, up), up)
 

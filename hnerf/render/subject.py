@@ -34,8 +34,8 @@ class RenderOptions:
     camera: a recorded camera's name; path: a file or folder of cameras to fly along (`read_camera_path`); with neither,
     the camera orbits at this radius and at this height above the person's centre, in metres (`orbit`). motion: another
     subject's folder, a BVH or an AMASS file (`read_motion`); frames: which of its frames (`select_frames`); between:
-    two frames to interpolate between. shape: amounts added to shape values; volume: relative change. what: of
-    OUTPUT_KINDS. size_px: the longest side of images. pictures: number of images.
+    two frames to interpolate between. shape: amounts added to shape values; volume: relative change. what: kinds of
+    output, from OUTPUT_KINDS. size_px: the longest side of images. pictures: number of images.
     """
 
     camera: str | None = None
@@ -53,9 +53,9 @@ class RenderOptions:
 
 
 def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
-    """Render a subject (<store>/subjects/<name>) into the new folder `out`; return the number of pictures.
+    """Render a subject (<store>/subjects/<name>) into the new folder `out`; return the number of images.
 
-    See `write_pictures` for the files. Raises InputError for options that cannot be met.
+    See `write_pictures` for the files. Raises InputError if the options cannot be met.
     """
     with atomic_folder(out) as partial:
         capture = _checked_capture(subject, options)
@@ -65,7 +65,7 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
         avatar = avatar_of(subject)
-        if options.between is not None:  # the first and the last pose alone would have a frame's own deformation
+        if options.between is not None:  # otherwise only the first and the last pose would have a frame's deformation
             avatar = avatar.without_frames()
         write_pictures(avatar.with_body(motion.body), shots, options.what, motion.fps, partial)
     return len(shots)
@@ -109,7 +109,7 @@ def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
 
 
 def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Camera]:
-    """Return one camera a picture."""
+    """Return one camera per image."""
     recorded = [capture.cameras[name] for name in capture.train_cameras]
     poses = len(body.frames) if len(body.frames) > 1 else None
     if options.camera is not None:

@@ -69,8 +69,8 @@ def read_camera_path(path: Path, size_px: tuple[int, int]) -> list[Camera]:
     """Read the cameras of a path, in the file's order: a JSON list of {"K", "R", "t_m", "size_px"} (conventions of
     hnerf.geometry.camera), or a folder in any layout that captures are read from.
 
-    size_px: (width, height) of images where the file does not say. Lens distortion is ignored. Raises InputError if
-    there are no cameras, or cameras of several image sizes.
+    size_px: (width, height) of images if the file does not say. Lens distortion is ignored. Raises InputError if there
+    are no cameras, or cameras of several image sizes.
     """
     if path.is_dir():
         lenses, metres_per_unit = list(recognise(path).lenses().values()), read_manifest(path).metres_per_unit

@@ -1,7 +1,7 @@
 """Automatic settings of the fast field and of training, from the capture's pixels, masks and poses.
 
-A setting of 0, or without cells, is open; what a preset or an override sets is kept. `benchmarks/budget.py` measures
-the effect of doubling and halving the settings.
+A setting that is 0, or has no cells, is open; values from a preset or an override are kept. `benchmarks/budget.py`
+measures the effect of doubling and halving the settings.
 """
 
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ MEAN_PATH = 2.4  # length of a ray's path through the shell in thicknesses, mean
 SAMPLE_CELLS, MAX_SAMPLE_M = 0.6, 0.006  # sample spacing, in the shell before training tightens it
 SHELL_MARGIN_M = 0.015  # beyond the extent of the masks, for poses that are still inaccurate
 MIN_THICKNESS_M, MAX_THICKNESS_M = 0.03, 0.15
-MASKS_PER_CAMERA = 6  # that are measured
+MASKS_PER_CAMERA = 6  # number of masks to measure
 MIN_POSE_STD_RAD = 0.05  # below it, nothing can be learned from joint angles
-GROUND_M, SUNK_M = 0.03, 0.05  # of the lowest points of bodies from height 0, in the median and at most below it
+GROUND_M, SUNK_M = 0.03, 0.05  # of bodies' lowest points: median distance from height 0, greatest depth below it
 ONE_POSTURE_RAD = 0.002  # std_rad below which the fit found one posture in all frames
 POSE_WIDTH = 8
 NODES = 128  # about 12 cm apart; finer detail, such as a collar, is left to the canonical surface
@@ -50,9 +50,9 @@ class SceneStatistics:
     """Statistics of the capture that determine settings.
 
     footprint_m: size of a pixel on the body, median over cameras. outside_m, inside_m: how far masks extend outside the
-    fitted body and stay inside it, for 99 % of their outlines. side_m: longest side of the rest body. std_rad: standard
-    deviation of the free joints, mean. person_px: pixels of the person in all training images. lowest_m: height of each
-    body's lowest point, median and minimum over frames.
+    fitted body and stay inside it, for 99 % of their outlines. side_m: longest side of the rest body. std_rad: mean
+    standard deviation of the free joints. person_px: pixels of the person in all training images. lowest_m: height of
+    each body's lowest point, median and minimum over frames.
     """
 
     cameras: int

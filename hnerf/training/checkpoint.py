@@ -22,8 +22,8 @@ NAME = "checkpoint.pt"
 
 
 def training_key(capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings) -> str:
-    """Return a digest of what a training is made from, by which its checkpoint is known; of images, only which there
-    are, because the body was fitted to them."""
+    """Return a digest of a training's inputs, which identifies its checkpoint. Of the masks' images it covers only
+    which ones exist, because the body was fitted to them."""
     digest = hashlib.sha256(f"{settings.key_values()} {capture.name} {capture.train_frames}".encode())
     for camera in capture.cameras.values():
         digest.update(f"{camera.name} {camera.width_px} {camera.height_px}".encode())
@@ -48,21 +48,21 @@ def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
             os.fsync(file.fileno())
         os.replace(beside, folder / NAME)
     finally:
-        beside.unlink(missing_ok=True)  # of a full disk: what says why needs room, too
+        beside.unlink(missing_ok=True)  # on a full disk, the message that says so needs room, too
 
 
 def load_checkpoint(folder: Path, device: torch.device, key: str) -> dict[str, Any] | None:
-    """Load the last checkpoint of the training with this key; None, with a warning where there is one, if it cannot be
-    read or is of another training. The next write replaces it."""
+    """Load the last checkpoint of the training with this key. Return None if there is none or, with a warning, if it
+    cannot be read or belongs to another training; the next write replaces it."""
     path = folder / NAME
     try:
-        with ZipFile(path) as archive:  # torch reads tensors without a look at their checksums
+        with ZipFile(path) as archive:  # torch reads tensors without checking their checksums
             if damaged := archive.testzip():
                 raise ValueError(f"{damaged} has changed")
         state = torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError:
         return None
-    except Exception as error:  # torch and its unpickler answer damage with nearly anything
+    except Exception as error:  # torch and its unpickler raise nearly anything on damage
         log.warning("%s: cannot be read (%s); the training starts again", path, printable(one_line(error)))
         return None
     if not isinstance(state, dict) or state.get("key") != key:

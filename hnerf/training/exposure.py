@@ -15,10 +15,10 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.training.auto_settings import Decision
 
-MAX_FRAMES = 8  # that are compared, evenly spaced
+MAX_FRAMES = 8  # number of frames to compare, evenly spaced
 MIN_FACING_COSINE = 0.4  # between a vertex's normal and its direction to the camera
 MIN_LEVEL, MAX_LEVEL = 15, 245  # of 255; levels outside are noise or clipped
-MIN_SHARED_VERTICES = 100  # of two cameras, for their ratio to count
+MIN_SHARED_VERTICES = 100  # by two cameras, for their ratio to count
 MAJORITY = 0.5  # share of the cameras
 MIN_LOG_GAIN = 0.1  # shading and small errors of the fit leave 0.03 for cameras exposed alike
 
@@ -27,10 +27,10 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
     """Return the gains (R, G, B) of the training cameras and the reason (with their means over channels); no gains if
     the cameras are exposed alike.
 
-    Where most cameras agree, their gain is 1, else the geometric mean of all is. A camera that shares no points with
-    another takes the median gain. Cameras a and b show the same body points brighter or darker by a median ratio r_ab
-    over points and frames; log g_b - log g_a = log r_ab is solved for all pairs by least squares, weighted by their
-    numbers of points.
+    If most cameras agree, their gain is 1; otherwise the geometric mean of all gains is 1. A camera that shares no
+    points with another takes the median gain. Cameras a and b show the same body points brighter or darker by a median
+    ratio r_ab over points and frames; log g_b - log g_a = log r_ab is solved for all pairs by least squares, weighted
+    by their numbers of points.
     """
     names = capture.train_cameras
     ratios: dict[tuple[int, int], list[np.ndarray]] = {pair: [] for pair in combinations(range(len(names)), 2)}

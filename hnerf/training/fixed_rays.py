@@ -1,4 +1,4 @@
-"""What a field shows on rays that stay the same: its PSNR on unseen frames, and whether it has a surface."""
+"""Checks of a field on rays that stay the same: its PSNR on unseen frames, and whether it has a surface."""
 
 import math
 from dataclasses import dataclass
@@ -41,9 +41,9 @@ class FixedRays:
 
     @torch.no_grad()
     def require_surface(self, scene: PosedScene[Any], rows: Tensor) -> None:
-        """Raise TrainingError if the surface is empty or fills the box. Of the background, rays through the box are
-        evaluated; away from outlines, which blurred surfaces cover, if enough of them are: a tight shell meets hardly
-        any others."""
+        """Raise TrainingError if the surface is empty or fills the box. Of the background, only rays through the box
+        count. Those near outlines, which blurred surfaces cover, are left out if enough others remain: a tight shell
+        meets hardly any others."""
         count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
         rays, samples = self.sample(scene, rows, count)
         coverage = self.field.coverage(samples)

@@ -20,7 +20,7 @@ from hnerf.training.pixels import Pixels
 from hnerf.training.plates import plates_of
 
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and background
-SUFFIX = ".pixels"  # of the files that hold the columns of Pixels; COLUMNS: their types and widths
+SUFFIX = ".pixels"  # of the files that hold the columns of Pixels; COLUMNS: the columns' types and widths
 COLUMNS = {
     "starts": (torch.int64, 1),
     "edges": (torch.int64, 1),
@@ -97,7 +97,7 @@ def _write_pixels(
             if visible_pixels:
                 wanted = visible_pixels(camera, vertices_m[body.index(frame)]) | mask
                 if plates:
-                    wanted &= plates[c].known | ~edge  # of the others the share of the person cannot be told
+                    wanted &= plates[c].known | ~edge  # at other edges, the person's share is unknown
                 columns.append("pixel_index", np.flatnonzero(wanted))
             columns.append("colour", _exposure_corrected(image[wanted], gain))
             columns.append("person", mask[wanted])
@@ -117,8 +117,8 @@ def _write_pixels(
 
 
 class _Columns:
-    """The columns of Pixels while their files are written; ends: how many rows the parts so far have, by column of
-    starts."""
+    """The columns of Pixels while their files are written; ends: number of rows in the parts written so far, by column
+    of starts."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.ends = folder, {"starts": 0, "edge_starts": 0, "image_starts": 0}

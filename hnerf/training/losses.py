@@ -50,7 +50,8 @@ def mask(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
 
 
 def fog(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
-    """Return fog: |(1 - M) C~|_1, for fields that model the background, since rec takes fog in the box for it."""
+    """Return fog: |(1 - M) C~|_1, for fields that model the background, since rec takes fog in the box for
+    background."""
     return (target.weight * (1 - target.person) * box_colour(samples).sum(1)).mean()
 
 
@@ -82,8 +83,8 @@ def segmentation(distance: Float[Tensor, "R K"], target: Target, sharpness: floa
 
 
 def _cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
-    """Return the BCE of probabilities inside (0, 1). NaN passes through, where torch's own function raises, so that the
-    step can be skipped."""
+    """Return the BCE of probabilities inside (0, 1). NaN passes through (torch's own function raises), so that the step
+    can be skipped."""
     return -(target * predicted.log() + (1 - target) * (1 - predicted).log())
 
 
@@ -104,8 +105,8 @@ def increment(correction: PoseCorrection) -> Float[Tensor, ""]:
 
 
 def floor(d_hat: Float[Tensor, "R K"], height_m: Float[Tensor, "R K"]) -> Float[Tensor, ""]:
-    """Return floor: sum_i relu(-d_hat_i) over samples below the ground, where nobody is: masks include the shadow under
-    a sole."""
+    """Return floor: sum_i relu(-d_hat_i) over samples below the ground, where nobody can be: masks include the shadow
+    under a sole."""
     return (relu(-d_hat) * (height_m < 0)).sum(1).mean()
 
 

@@ -1,5 +1,5 @@
-"""Gradient accumulation: the rays of a step in as many parts as memory requires; their gradients add up to those of the
-joint batch."""
+"""Gradient accumulation: the rays of a step are divided into as many parts as memory requires, whose gradients add up
+to those of the joint batch."""
 
 import math
 import sys
@@ -19,7 +19,7 @@ from hnerf.training.auto_settings import Decision
 from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import PixelRays
 
-CPU_PARTS = 2  # side by side on a CPU, because operations are too small to share cores; a sum of two is deterministic
+CPU_PARTS = 2  # in parallel on a CPU, because operations are too small to share cores; a sum of two is deterministic
 USABLE_SHARE = 0.8  # of the free memory, for fragmentation and differences between rays
 PEAK_FACTOR = 1.3  # CPU peak relative to tensors saved for gradients: 1.26 to 1.29 by hand (`fast`, `paper`)
 FEW_RAYS, MORE_RAYS = 32, 64  # of the trial batches
@@ -28,7 +28,7 @@ MEMINFO = Path("/proc/meminfo")
 
 
 class Parts:
-    """Parts of a process's rays: `count` of them, side by side in threads or one after another. most_rays: how many fit
+    """Parts of a process's rays: `count` of them, in parallel threads or one after another. most_rays: how many fit
     into memory at once."""
 
     def __init__(self, count: int, side_by_side: bool, most_rays: float):
@@ -43,8 +43,8 @@ class Parts:
         """Add the gradients of this process's share of a joint batch to the parameters' gradients; return the losses by
         name.
 
-        Losses are means over rays, or do not depend on them: weighted by their rays, the parts add up to the joint
-        batch. `module` averages over processes with the last part.
+        Losses are means over rays, or do not depend on them: weighted by their numbers of rays, the parts add up to the
+        joint batch. `module` averages over processes at the last part.
         """
         n, world_size = self.count, processes.world_size
 
@@ -67,12 +67,13 @@ def decide_parts(
 ) -> tuple[Parts, Decision]:
     """Decide into how many parts each process divides `rays` per step; return the parts and the reason.
 
-    memory_gib: memory for them; None: what is free. trial_loss: maps an approximate number of rays to the number and
-    loss of a trial batch. Two small batches are measured: their difference is due to the rays, the rest is a constant.
+    memory_gib: memory for them; None: all that is free. trial_loss: maps an approximate number of rays to the number
+    and loss of a trial batch. Two small batches are measured: their difference is due to the rays, the rest is a
+    constant.
     """
     device, share = processes.device, math.ceil(rays / processes.world_size)
     if device.type == "cuda":
-        _peak_bytes(trial_loss, FEW_RAYS, device)  # what libraries allocate once
+        _peak_bytes(trial_loss, FEW_RAYS, device)  # libraries allocate some memory only once
     (few, least), (more, most) = (_peak_bytes(trial_loss, about, device) for about in (FEW_RAYS, MORE_RAYS))
     each = max(1.0, (most - least) / (more - few))
     room = USABLE_SHARE * _free_bytes(processes) if memory_gib is None else memory_gib * GIB

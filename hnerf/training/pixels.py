@@ -49,7 +49,7 @@ class Pixels:
         self, frames: Tensor, rays_per_frame: int, generator: torch.Generator, edge_share: float = EDGE_SHARE
     ) -> PixelRays:
         """Draw `rays_per_frame` pixels of each of the frames (rows) with replacement, a share `edge_share` of them at
-        edges, to the device of the frames and the generator."""
+        edges. Return their rays on the device of the frames and the generator."""
         shape = len(frames), rays_per_frame
         unit = torch.rand(shape, generator=generator, dtype=torch.float64, device=frames.device).cpu()
         rows, count = frames.cpu(), round(edge_share * rays_per_frame)

@@ -1,4 +1,4 @@
-"""What stands behind the person in a camera: its clean plate, or the background that people leave free at times."""
+"""The background behind the person in each camera: its clean plate, or what people leave uncovered at times."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.segmentation.difference import masked_median
 
 FRAMES = 60  # at most, evenly spaced, of which the background is the median
-BESIDE_PX = 5  # around a mask, where a pixel may show the person or a shadow of contact
+BESIDE_PX = 5  # around a mask, where a pixel may show the person or a contact shadow
 MOSTLY = 0.5  # share of the outlines that must lie on known background
 
 
@@ -24,8 +24,9 @@ class Plate:
 
 
 def plates_of(capture: Capture, masks: Masks, frames: tuple[int, ...]) -> list[Plate] | None:
-    """Return the plates of the training cameras, clean ones if there are, else as masks leave them free; None if a
-    camera's person hides the background behind most of their own outline in all frames."""
+    """Return the plates of the training cameras: clean ones if there are any, otherwise the background that masks leave
+    uncovered. None if, in some camera, the person hides the background behind most of their own outline in all
+    frames."""
     plates = []
     for name in capture.train_cameras:
         clean = capture.background(name)

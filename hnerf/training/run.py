@@ -25,7 +25,7 @@ from hnerf.training.trainer import train
 
 def main() -> int:
     """Train; return 0, or print one line that begins with REASON on standard error and return 2 for bad input, 3 for a
-    training that cannot go on, 4 for failed input or output, as JSON: errno, its meaning, file."""
+    training that cannot go on, 4 for failed input or output, where the line holds JSON: errno, its meaning, file."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name in ("capture", "calibration", "masks", "fit"):
         parser.add_argument(name, type=Path)
@@ -49,7 +49,7 @@ def main() -> int:
         print(f"{REASON}{told}", file=sys.stderr)
         return 4
     finally:
-        progress.report("training", 1, 1)  # ended, however
+        progress.report("training", 1, 1)  # ended, successfully or not
         if dist.is_initialized():
             dist.destroy_process_group()
     return 0

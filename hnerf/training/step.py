@@ -26,8 +26,7 @@ class Objective(nn.Module):
     def __init__(
         self, field: Field, correction: PoseCorrection, settings: TrainingSettings, ground_axis: int | None = None
     ):
-        """ground_axis: the vertical axis of a world with its ground at 0; None if it is not known where the ground
-        is."""
+        """ground_axis: the vertical axis of a world with its ground at 0; None if the ground's height is unknown."""
         super().__init__()
         self.field, self.correction, self.settings = field, correction, settings
         self.ground_axis = ground_axis
@@ -74,8 +73,8 @@ def make_target(rays: PixelRays, draws: Draws, models_background: bool) -> tuple
 
 
 def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int, processes: Distributed) -> str | None:
-    """Return None if all values are finite in all processes, so that they go on or skip together; else name the losses
-    or gradients that are not. Values are read from the device once."""
+    """Return None if all values are finite in all processes, so that these continue or skip together; otherwise a
+    message that names the losses or gradients that are not. Values are read from the device once."""
     values = torch.stack([value.detach() for value in terms.values()] + [g.sum() for g in gradients])
     finite = values.isfinite().tolist()
     if not processes.all_max(float(not all(finite))):

@@ -43,7 +43,7 @@ FINAL_LEARNING_RATE = 0.1  # at the end, relative to the first
 SKIPS_ALLOWED = 2  # consecutive; one more non-finite step stops the run
 LOG_STEPS = 25
 CURVE_STEPS = 100  # between the points of the curve on unseen frames, each of which takes as long as a step
-TRIAL_FRAMES = 8  # at most, to measure the memory of rays
+TRIAL_FRAMES = 8  # at most, to measure the memory that rays need
 POSE_STRIDE = 6  # between the training poses for which the shell is tightened
 
 
@@ -220,8 +220,8 @@ class Trainer:
         return terms
 
     def _trial_loss(self, about: int) -> tuple[int, Tensor]:
-        """Return the number of rays, about `about`, and the loss of a batch as at the end of training. The training's
-        random numbers are not consumed."""
+        """Return the number of rays, about `about`, and the loss of a batch as at the end of training. It does not
+        consume the training's random numbers."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rows, noise = self.train_rows[: self.settings.frames_per_step][:TRIAL_FRAMES], self.settings.noise
         rays = self.pixels.draw(rows, about // len(rows), generator, self.edge_share)
@@ -237,7 +237,7 @@ class Trainer:
         return (self.step - self.field_steps) / s.novel_pose_steps
 
     def _report_progress(self) -> None:
-        """Report the steps done of both phases, or as many as the time used stands for if that is more."""
+        """Report the steps done in both phases, or as many as the time used amounts to if that is more."""
         done = self._progress() * self.field_steps if self.step < self.field_steps else self.step
         report("training", done, self.steps)
 
@@ -285,7 +285,7 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.history = json.loads(state["history"])
         rig = dataclasses.replace(self.body.rig, **state["rig"])
-        # from the fit, as in an uninterrupted training: bit by bit the same
+        # from the fit, as in an uninterrupted training, so that it is the same bit by bit
         self.scene.bodies.set_poses(rig, state["theta"], state["root"])
         self._set_poses(self.scene.bodies)
         if self.step > self.field_steps:
@@ -293,8 +293,8 @@ class Trainer:
         logger.info("resumed at step %d", self.step)
 
     def _lacks_snapshots(self, seconds: float) -> bool:
-        """Return whether a snapshot is not there that was due in the first `seconds`, as where another machine made the
-        checkpoint; warn if so."""
+        """Return whether a snapshot that was due in the first `seconds` is missing, for example because another machine
+        made the checkpoint; warn if so."""
         due_s = [s for s in self.settings.snapshots_s if s <= seconds]
         missing = [str(folder) for folder in map(self._snapshot, due_s) if not (folder / "settings.json").exists()]
         if missing:
@@ -351,8 +351,8 @@ def train(
     out: Path,
     processes: Distributed | None = None,
 ) -> TrainingReport | None:
-    """Train the subject into `out`, from its checkpoint if there is one; return the report, None in a process that
-    writes none.
+    """Train the subject into `out`, continuing from its checkpoint if there is one; return the report, None in a
+    process that writes none.
 
     The last checkpoint is kept, so that a training stopped while writing its files need only write them again; the
     caller deletes it. Raises TrainingError if the surface collapses or the losses stay non-finite.
