@@ -19,14 +19,15 @@ S = TypeVar("S", bound=BaseModel)
 CONFIGS = Path(__file__).parent.parent / "configs"
 Seed = Annotated[int, Field(ge=0, lt=2**63)]  # of any generator
 MAX_BYTES = 65_536  # of a file of settings
-NULLS = ("", "~", "null", "Null", "NULL")  # as YAML reads nothing
-CLOSE = 0.7  # of difflib: keys that are taken for misspelled ones
+NULLS = ("", "~", "null", "Null", "NULL")  # spellings that YAML reads as null
+CLOSE = 0.7  # difflib ratio from which an unknown key counts as a misspelled one
 
 
 class Section(BaseModel):
     """Settings of one stage: frozen, without unknown keys or values outside their type.
 
-    excluded_from_key: names of those that the stage's cache key leaves out, since its result does not depend on them.
+    excluded_from_key: names of settings that the stage's cache key leaves out, since its result does not depend on
+    them.
     """
 
     excluded_from_key: ClassVar[tuple[str, ...]] = ()
@@ -41,7 +42,7 @@ class CaptureSettings(Section):
     """Settings of ingestion."""
 
     max_side_px: int = Field(default=1024, ge=16)  # larger images are shrunk to this longest side at ingestion
-    max_frames: int = Field(default=60, ge=1)  # most training frames, evenly spaced, where capture.toml lists none
+    max_frames: int = Field(default=60, ge=1)  # most training frames, evenly spaced, if capture.toml lists none
 
 
 class SyntheticSettings(Section):
@@ -65,7 +66,7 @@ class SyntheticSettings(Section):
 class DetectionSettings(Section):
     source: Literal["recording", "network", "both"] | None = None  # null: see docs/formats.md, From a network
     size: Literal["heavy", "full", "lite"] = "heavy"  # of the landmark network
-    hands: Literal["auto", "none"] = "auto"  # auto: find the hands if the networks are installed; 0.04 s an image
+    hands: Literal["auto", "none"] = "auto"  # auto: find the hands if the networks are installed; 0.04 s per image
 
 
 class CalibrationSettings(Section):
@@ -78,26 +79,26 @@ class CalibrationSettings(Section):
 class SegmentationSettings(Section):
     """Settings of the masks."""
 
-    excluded_from_key: ClassVar[tuple[str, ...]] = ("rounds", "still_px")  # of the flow, which repeats the stage
+    excluded_from_key: ClassVar[tuple[str, ...]] = ("rounds", "still_px")  # the flow uses them: it repeats the stage
     shadow_chroma: float = Field(default=0.01, gt=0)  # std of log colour ratios in a shadow, beyond noise
     darkest_shadow: float = Field(default=0.3, gt=0, lt=1)  # brightness left in the deepest shadow, as a share
     reach: float = Field(default=0.13, gt=0)  # of clothes and hair beyond the limbs, in body heights
     model: Path | None = None  # ONNX segmentation network; comes before clean plates, after given masks
-    rounds: int = Field(default=3, ge=1)  # most rounds of fit and segmentation, without masks and plates
+    rounds: int = Field(default=3, ge=1)  # most rounds of fit and segmentation, if there are neither masks nor plates
     still_px: float = Field(default=0.5, gt=0)  # rounds end when mask edges move less than this on average
 
 
 class FitSettings(Section):
     """Settings of the body fit: standard deviations, unless said otherwise.
 
-    Shape values are anny's: phenotypes in [0, 1], local changes in [-1, 1]. SMPL's betas have a standard deviation of
-    their own, 1.
+    Shape values are anny's: phenotypes in [0, 1], local changes in [-1, 1]. SMPL's betas have their own standard
+    deviation, 1.
     """
 
     body_model: Literal["anny"] | Path = "anny"  # or the path of an SMPL, SMPL-H or SMPL-X file (.npz, .pkl)
     keypoint_m: float = Field(default=0.02, gt=0)  # std of a keypoint seen with full confidence
     keypoint_outlier_m: float = Field(default=0.15, gt=0)  # a keypoint farther off counts as an outlier
-    offset_m: float = Field(default=0.02, gt=0)  # std between the detector's and the body model's place of a keypoint
+    offset_m: float = Field(default=0.02, gt=0)  # std of the detector's place of a keypoint about the body model's
     stature_m: float = Field(default=1.72, gt=0)  # mean height of people
     stature_std_m: float = Field(default=0.08, gt=0)  # std of the height of people
     phenotype_std: float = Field(default=0.25, gt=0)  # std of anny's phenotype values
@@ -114,8 +115,8 @@ class FieldSettings(Section):
     """Settings that all fields have.
 
     tunes_poses: whether training refines poses and shape, as H-NeRF's fields do; compared methods take them as fitted.
-    models_motion: a field without it needs a single training frame. no_new_poses: the reason why it cannot render a
-    pose that it was not trained on, empty where it can.
+    models_motion: whether the field can be trained on more than one frame. no_new_poses: the reason why it cannot
+    render a pose that it was not trained on, empty if it can.
     """
 
     tunes_poses: ClassVar[bool] = False
@@ -152,7 +153,7 @@ class PaperFieldSettings(FieldSettings):
     tunes_poses: ClassVar[bool] = True
     kind: Literal["paper"] = "paper"
     samples: int = Field(default=256, ge=2)  # coarse samples per ray, and as many fine ones
-    box_samples: int = Field(default=0, ge=0)  # how many of the coarse samples lie in the person's box only
+    box_samples: int = Field(default=0, ge=0)  # number of coarse samples that are spent on the person's box only
     rays: Literal["image", "box"] = "image"  # train on all pixels, or on those whose rays meet the person's box
     gamma: float = Field(default=200.0, gt=0)  # sharpness of the surface, per scene unit
     learning_rate: float = Field(default=1e-3, gt=0)
@@ -231,7 +232,7 @@ class LossSettings(Section):
     increment: float = Field(default=0.02, ge=0)
     elastic: float = Field(default=0.0, ge=0)  # not in the paper: smooths the deformations of `fast` and Nerfies
     floor: float = Field(default=0.0, ge=0)  # per metre, not in the paper: keeps the surface above the ground
-    fog: float = Field(default=0.0, ge=0)  # not in the paper: empties the box beside the person
+    fog: float = Field(default=0.0, ge=0)  # not in the paper: empties the box around the person
     eta: float = Field(default=1.0, ge=0)  # weight of the surroundings in blend; 0.25 near floor or furniture
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
     geometry_roles: GeometryRoles = "surface_leads"  # whether geometry moves the density alone, or both
@@ -246,7 +247,7 @@ AnyFieldSettings = (
 class TrainingSettings(Section):
     """Settings of training: the field with its own settings, the losses and the optimisation."""
 
-    excluded_from_key: ClassVar[tuple[str, ...]] = ("processes", "memory_gib")  # but for the order of sums
+    excluded_from_key: ClassVar[tuple[str, ...]] = ("processes", "memory_gib")  # they change only the order of sums
     field: AnyFieldSettings = Field(default=FastFieldSettings(), discriminator="kind")
     losses: LossSettings = LossSettings()
     steps: int = Field(default=0, ge=0)  # 0: chosen from the scene
@@ -281,7 +282,7 @@ class TrainingSettings(Section):
 class EvaluationSettings(Section):
     """Settings of the evaluation and its report."""
 
-    excluded_from_key: ClassVar[tuple[str, ...]] = ("holdout",)  # of the flow, which names the camera to the stage
+    excluded_from_key: ClassVar[tuple[str, ...]] = ("holdout",)  # the flow uses it and passes the camera to the stage
     max_meshes: int = Field(default=4, ge=1)  # per split
     max_images: int | None = Field(default=None, ge=1)  # per split; null: all
     report_rows: int = Field(default=3, ge=1)  # frames shown per split
@@ -317,7 +318,7 @@ class LimitSettings(Section):
 
 
 class Settings(Section):
-    """All settings of a run, one section a stage, whose cache key depends on its own section only; and its limits."""
+    """All settings of a run: one section per stage, on which alone its cache key depends, and the limits."""
 
     capture: CaptureSettings = CaptureSettings()
     detection: DetectionSettings = DetectionSettings()
@@ -340,9 +341,9 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
 
 
 def preset_tree(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return the tree in a preset's file, merged over that of the preset which it names as `based_on`, if any, a path
-    in the same folder or the working directory. derived: the presets that are based on this one. Raises InputError
-    where it is among them."""
+    """Return the tree of a preset's file, merged over that of the preset that it is `based_on`, if any: a name, or a
+    path in the same folder or the working directory. derived: the presets that are based on this one. Raises InputError
+    if it is among them."""
     if path.resolve() in derived:
         raise InputError(f"{path}: is based on itself; correct based_on in it")
     tree = read_yaml(path)
@@ -366,7 +367,7 @@ def overridden(settings: S, overrides: Sequence[str]) -> S:
             raise InputError(f"--set {key}: no such key; `hnerf settings` lists them")
         change: Any = value.strip()
         literal = change[:1] not in ("'", '"') and change not in NULLS
-        if not (literal and _is_text(settings, parts)):  # in text, "1.10" and "by A: b # 3" are what they are
+        if not (literal and _is_text(settings, parts)):  # in text, "1.10" and "by A: b # 3" are kept as they are
             change = parse_yaml(value, f"--set {override}")
         for part in reversed(parts):
             change = {part: change}
@@ -385,7 +386,7 @@ def _is_text(settings: BaseModel, key: Sequence[str]) -> bool:
 
 
 def with_changes(settings: Settings, path: Path) -> Settings:
-    """Return settings with the values replaced that a YAML file names, such as one of `configs/ablations/`.
+    """Return settings with those values replaced that a YAML file gives, such as one of `configs/ablations/`.
 
     Raises InputError with one line if the file is not YAML, or a key or value is not allowed.
     """
@@ -407,7 +408,7 @@ def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 def named_file(name: str, folder: Path, one: str, many: str, beside: Path = Path()) -> Path:
     """Return the path of the YAML file of this name in a folder, or else `name` itself as a path, in the folder
-    `beside` or the working directory. Raises InputError, which lists the files of the folder, where there is none."""
+    `beside` or the working directory. Raises InputError, which lists the files of the folder, if there is none."""
     with suppress(OSError, ValueError):  # of a name that is too long, or holds a NUL
         for path in (folder / f"{name}.yaml", beside / name, Path(name)):
             if path.is_file():
@@ -417,8 +418,8 @@ def named_file(name: str, folder: Path, one: str, many: str, beside: Path = Path
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the keys and values of a YAML file, an empty dictionary for an empty file. Raises InputError, one line,
-    where it holds anything else, or more than settings need."""
+    """Return the keys and values of a YAML file, an empty dictionary for an empty file. Raises InputError, one line, if
+    it holds anything else, or more than settings need."""
     with path.open("rb") as file:
         text = file.read(MAX_BYTES + 1)
     if len(text) > MAX_BYTES:
@@ -439,7 +440,7 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
         key: list[str] = []
         node = tree
         for part in first["loc"]:
-            with suppress(LookupError, TypeError):  # kinds of a union are named, too, and are no keys of the tree
+            with suppress(LookupError, TypeError):  # the location also names kinds of a union, which are no keys
                 node = node[part]
                 key.append(str(part))
         key += [str(part) for part in first["loc"][-1:] if first["type"] == "missing"]

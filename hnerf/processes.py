@@ -10,7 +10,7 @@ _libc = ctypes.CDLL(None)
 
 def end_with_parent(last: signal.Signals, parent: int) -> None:
     """Have the kernel (Linux) send this process a signal when its parent, with process id `parent`, dies; send it now
-    if that has died already."""
+    if the parent has died already."""
     if hasattr(_libc, "prctl"):
         _libc.prctl(PR_SET_PDEATHSIG, last)
         if os.getppid() != parent:

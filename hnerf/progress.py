@@ -1,4 +1,4 @@
-"""How far long work has come: log records at DEBUG, which a display draws and nobody else sees."""
+"""Progress of long work: log records at DEBUG level, which a display draws and which are otherwise hidden."""
 
 import json
 import logging
@@ -16,7 +16,7 @@ RELAY_EVERY_S = 0.5
 
 
 class Progress(NamedTuple):
-    """What a record carries as its attribute `progress`; the work has ended when all is done."""
+    """The attribute `progress` of a log record; the work has ended when `done` reaches `total`."""
 
     what: str
     done: float
@@ -27,7 +27,7 @@ _listeners: list[Callable[[Progress], None]] = []
 
 
 def report(what: str, done: float, total: float) -> None:
-    """Log how much of the work called `what` is done, and tell those who listen."""
+    """Log how much of the work called `what` is done, and call the listeners."""
     progress = Progress(what, done, total)
     log.debug("%s: %g of %g", what, done, total, extra={"progress": progress})
     for listener in _listeners:
@@ -36,7 +36,7 @@ def report(what: str, done: float, total: float) -> None:
 
 @contextmanager
 def listening(listener: Callable[[Progress], None]) -> Iterator[None]:
-    """Call the listener at every report that this process makes inside."""
+    """Call the listener at every report that this process makes inside the context."""
     _listeners.append(listener)
     try:
         yield
@@ -73,9 +73,9 @@ class _Relay(logging.Handler):
 
 
 def report_relayed(line: str) -> bool:
-    """Report what a line says that another process wrote since it called `relay`; return whether it is such a line.
-    What follows in the line is left out: processes and their libraries share one pipe, and do not wait for each other's
-    line ends."""
+    """Report the progress in a line that another process wrote after calling `relay`; return whether it is such a line.
+    The rest of the line is dropped: processes and their libraries share one pipe, and do not wait for each other's line
+    ends."""
     if line.startswith(RECORD_SEPARATOR):
         progress, _ = json.JSONDecoder().raw_decode(line.removeprefix(RECORD_SEPARATOR))
         report(*progress)

@@ -1,4 +1,4 @@
-"""What stages write as JSON: every key with its type and unit; others are refused when a file is written.
+"""The JSON that stages write: every key with its type and unit; other keys are refused when a file is written.
 
 `python -m hnerf.results FOLDER` writes a JSON schema of each file, as in docs/schemas/.
 """
@@ -219,12 +219,12 @@ FILES: dict[str, Any] = {
 
 
 def _closed(kind: Any) -> TypeAdapter[Any]:
-    """Return what checks a kind of result: neither it nor what is in it has other keys."""
+    """Return a validator of a kind of result that allows no other keys, in it or in its parts."""
     return TypeAdapter(with_config(ConfigDict(extra="forbid"))(kind))
 
 
 def write_result(path: Path, kind: Any, result: Any) -> None:
-    """Write a result as JSON. Raises ValidationError if it has another key than its kind, or a value of another
+    """Write a result as JSON. Raises ValidationError if it has a key that its kind lacks, or a value of another
     type."""
     _closed(kind).validate_python(result)
     path.write_text(json.dumps(result, indent=1))

@@ -17,9 +17,9 @@ CPU = torch.device("cpu")
 def side_by_side(
     work: Callable[[T], R], items: Iterable[T], device: torch.device = CPU, threads: int | None = None
 ) -> Iterator[R]:
-    """Yield work(item) of each item in order: one after another on a GPU, in several threads on a CPU. These divide
-    `threads` threads of torch among them, by default as many as torch has. What is ready and not yet taken is at most
-    one more than there are threads."""
+    """Yield work(item) for each item in order: one after another on a GPU, in several threads on a CPU. These share
+    `threads` torch threads, by default as many as torch has. At most one more result than there are threads waits to be
+    taken."""
     threads = threads or torch.get_num_threads()
     workers = min(threads, MOST_AT_ONCE) if device.type == "cpu" else 1
     if workers == 1:

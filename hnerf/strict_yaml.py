@@ -1,4 +1,4 @@
-"""YAML without the parts by which a small file becomes large or says two things: aliases, deep nesting, a key twice."""
+"""YAML without what lets a small file become large or contradict itself: aliases, deep nesting, duplicate keys."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from yaml.composer import Composer
 from hnerf.errors import InputError
 
 MAX_DEPTH = 32  # of nested lists and dictionaries
-# What PyYAML raises on tags without their value ("x: !!int", "x: !!timestamp"), beside its own.
+# What PyYAML raises, in addition to its own errors, on tags without their value ("x: !!int", "x: !!timestamp").
 ERRORS = (yaml.YAMLError, AttributeError, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
 
 
 class _Strict:
-    """A composer that refuses what the module says, for a loader of PyYAML."""
+    """A composer for a PyYAML loader that refuses the features that the module's docstring lists."""
 
     depth = 0
 
@@ -37,7 +37,7 @@ class _SafeLoader(_Strict, yaml.SafeLoader):
 
 
 class _StringLoader(_Strict, getattr(yaml, "CBaseLoader", yaml.BaseLoader), Composer):  # type: ignore[misc]
-    """Parses in C, which is faster, where that was built; composes in Python, which is strict."""
+    """Parses in C, which is faster, if PyYAML was built with it; composes in Python, which is strict."""
 
     get_single_node = Composer.get_single_node
 
@@ -47,8 +47,8 @@ class _StringLoader(_Strict, getattr(yaml, "CBaseLoader", yaml.BaseLoader), Comp
 
 
 def parse_yaml(text: str | bytes, source: object) -> Any:
-    """Return what YAML text says, as numbers, text, lists and dictionaries. Raises InputError, one line that begins
-    with `source`, where it is not YAML or not strict."""
+    """Return the content of YAML text, as numbers, text, lists and dictionaries. Raises InputError, one line that
+    begins with `source`, if it is not YAML or not strict."""
     try:
         return yaml.load(text, Loader=_SafeLoader)
     except ERRORS as error:
@@ -56,8 +56,8 @@ def parse_yaml(text: str | bytes, source: object) -> Any:
 
 
 def parse_yaml_strings(text: str) -> Any:
-    """Return what YAML text says, every scalar as a string, whatever its tag. Raises ValueError where it is not YAML or
-    not strict."""
+    """Return the content of YAML text, every scalar as a string, whatever its tag. Raises ValueError if it is not YAML
+    or not strict."""
     try:
         return yaml.load(text, Loader=_StringLoader)
     except ERRORS as error:

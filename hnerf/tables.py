@@ -15,12 +15,12 @@ def line(cells: Sequence[str]) -> str:
 
 
 def shown(value: float | None, form: str) -> str:
-    """Return a figure formatted as `form` says, or "-" where there is none."""
+    """Return a figure in the format `form`, or "-" if there is none."""
     return "-" if value is None else form.format(value)
 
 
 def pick(tree: Mapping[str, Any], key: str) -> Any:
-    """Return a value deep in a tree by its path, such as "geometry.iou"; None where a branch on the way is missing or
+    """Return a value deep in a tree by its path, such as "geometry.iou"; None if a branch on the way is missing or
     null."""
     value: Any = tree
     for part in key.split("."):

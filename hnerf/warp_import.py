@@ -1,4 +1,4 @@
-"""warp, imported without its banner and its warnings. Every module takes it from here."""
+"""warp, imported without its banner and its warnings. Every module imports it from here."""
 
 import warp as wp
 

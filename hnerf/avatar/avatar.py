@@ -34,7 +34,8 @@ class Avatar(Protocol):
     def gains(self) -> Gains: ...
 
     def without_frames(self) -> "Avatar":
-        """Return the same person without what was learned for single frames, as it looks in a pose of no frame."""
+        """Return the same person without what was learned for single frames, as it looks in a pose that belongs to no
+        frame."""
         ...
 
     def with_body(self, body: BodyFit) -> "Avatar":
@@ -44,8 +45,8 @@ class Avatar(Protocol):
 
     def frame_displacements(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         """Return how far the surface next to points (N, 3) around the body at rest is moved by what was learned for the
-        frames of poses theta (n, J, 3), root (n, 4, 4), relative to a pose of no frame: (n, N, 3), in the axes of the
-        body at rest."""
+        frames of poses theta (n, J, 3), root (n, 4, 4), relative to a pose that belongs to no frame: (n, N, 3), in the
+        axes of the body at rest."""
         ...
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:

@@ -87,7 +87,8 @@ class StaticField(BoxField):
 
 class DynamicField(BoxField):
     """Base of NeuralBody and Nerfies: a density field and a learned code per frame. Codes start at zero and stay zero
-    for frames that are not trained on; a pose of no frame (Conditions.frame_row = -1) takes the zero code."""
+    for frames that are not trained on; a pose that belongs to no frame (Conditions.frame_row = -1) takes the zero
+    code."""
 
     def __init__(self, body: BodyFit, samples: int, learning_rate: float, code_width: int):
         super().__init__(body, samples, learning_rate)

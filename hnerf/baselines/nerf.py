@@ -44,9 +44,9 @@ class NerfField(StaticField):
     """Static field: a coarse and a fine network, hierarchical sampling, view-dependent colour. Of the body it uses only
     the box.
 
-    The first samples of a ray belong to the coarse network; their opacity is `alpha_dot`, that of the fine network's
-    samples is `alpha`, each zero at the samples of the other. So the loss `reconstruction` is that of the fine colour,
-    and `blend` with eta = 1 that of the coarse one: the two terms of the paper's equation 6.
+    The first samples of a ray belong to the coarse network. Its opacity is `alpha_dot`, the fine network's is `alpha`;
+    each is zero at the other network's samples. So the loss `reconstruction` measures the fine colour, and `blend` with
+    eta = 1 the coarse one: the two terms of the paper's equation 6.
 
     Simplified: both terms are absolute errors, as for all compared methods, not squared ones; as many fine samples as
     coarse ones (64 and 128 in the paper); smaller networks, so that minutes on two CPU cores are meaningful (8 layers

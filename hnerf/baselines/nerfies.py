@@ -50,9 +50,9 @@ class NerfiesField(DynamicField):
     """Dynamic field: each frame's code deforms the space of its instant into one template, a NeRF. Of the body it uses
     only the box.
 
-    It has no pose control. A pose of no frame (Conditions.frame_row = -1) and a frame that was not trained on take the
-    zero code: the template as this code deforms it, the same for every pose, cut by the pose's box. If that box is
-    elsewhere, it shows little or nothing.
+    It has no pose control. A pose that belongs to no frame (Conditions.frame_row = -1) and a frame that was not trained
+    on take the zero code: the template as this code deforms it, the same for every pose, cut by the pose's box. If that
+    box is elsewhere, it shows little or nothing.
 
     Simplified: one template network serves coarse and fine samples, and only the fine pass is trained, as in H-NeRF;
     networks and numbers of samples are smaller, so that minutes on two CPU cores are meaningful; no appearance codes,

@@ -60,7 +60,7 @@ def _root(rig: Rig, pelvis_turns: Tensor, placed: Tensor, is_smpl: bool) -> Tens
 
 
 def given_poses_note(model: BodyModel, capture: Capture) -> str:
-    """Return what the report says about given poses."""
+    """Return the report's note about given poses."""
     how = "used as the start" if model.is_smpl else "are SMPL's: used as the start, by corresponding joints"
     return how if capture.has_keypoints else f"{how}, and in place of keypoints, which are missing"
 

@@ -112,7 +112,7 @@ class Rig:
 
 
 def _require_agreement(arrays: Mapping[str, np.ndarray]) -> None:
-    """Raise ValueError, naming the array, if one has other axes than AXES says, or an index beyond the others."""
+    """Raise ValueError, naming the array, if one does not have its axes in AXES, or holds an index out of range."""
     sizes = {"3": 3}
     for name, axes in AXES.items():
         shape = arrays[name].shape

@@ -118,7 +118,7 @@ class Field(nn.Module, ABC):
 
     def frame_displacements(self, bodies: PosedBodies, points_m: Tensor, frame_row: Tensor) -> Tensor:
         """Return how far the frames of rows `frame_row` (n,) move the surface next to points (N, 3) around the first
-        body, which is at rest, from where it is in a pose of no frame, (n, N, 3)."""
+        body, which is at rest, from where it is in a pose that belongs to no frame, (n, N, 3)."""
         return points_m.new_zeros(len(frame_row), *points_m.shape)
 
     @abstractmethod

@@ -19,7 +19,8 @@ Batch = TypeVar("Batch", bound="DataclassInstance")
 @dataclass(frozen=True)
 class Conditions:
     """Conditioning by body row: pose (n, 3 free), the angles of the free joints; root (n, 12), the rows of T with the
-    translation in scene units; frame_row (n,), the row of the body fit with this pose, -1 for a pose of no frame."""
+    translation in scene units; frame_row (n,), the row of the body fit with this pose, -1 for a pose that belongs to no
+    frame."""
 
     pose: Tensor
     root: Tensor

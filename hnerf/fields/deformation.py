@@ -16,7 +16,7 @@ class FrameDeformation(nn.Module):
     """Displacements of nodes on the body in every frame; vertices follow the nodes around them.
 
     This is the embedded deformation of Sumner et al. 2007 without its rotations. displacement (frames + 1, nodes, 3) in
-    canonical metres starts at zero; its last row is for poses of no frame.
+    canonical metres starts at zero; its last row is for poses that belong to no frame.
     """
 
     node_weights: Tensor

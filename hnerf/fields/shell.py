@@ -127,8 +127,8 @@ def _classify_cells(size: list[int], points: Tensor, outer: Tensor, inner: Tenso
 
 
 def _within(size: list[int], points: Tensor, reach: Tensor) -> Tensor:
-    """Return the cells whose centres are at most as far from that of a point's cell as the point reaches, in a bool
-    tensor of this size; points (V, 3), reach (V,)."""
+    """Return the cells whose centres lie within a point's reach of the centre of its cell, as a bool tensor of this
+    size; points (V, 3), reach (V,)."""
     index = (points[:, 0] * size[1] + points[:, 1]) * size[2] + points[:, 2]
     farthest = torch.zeros(math.prod(size), device=points.device).scatter_reduce_(0, index, reach.float(), "amax")
     centres = torch.nonzero(farthest.view(size))

@@ -22,8 +22,8 @@ NAME = "checkpoint.pt"
 
 
 def training_key(capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings) -> str:
-    """Return a digest of a training's inputs, which identifies its checkpoint. Of the masks' images it covers only
-    which ones exist, because the body was fitted to them."""
+    """Return a digest of a training's inputs, which identifies its checkpoint. Of the images it covers only which ones
+    there are, because the body was fitted to them."""
     digest = hashlib.sha256(f"{settings.key_values()} {capture.name} {capture.train_frames}".encode())
     for camera in capture.cameras.values():
         digest.update(f"{camera.name} {camera.width_px} {camera.height_px}".encode())

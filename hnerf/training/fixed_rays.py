@@ -35,7 +35,7 @@ class FixedRays:
     def psnr(self, scene: PosedScene[Any], rows: Tensor) -> float | None:
         """Return the PSNR on the person's pixels of the frames in rows; None if none is drawn."""
         rays, samples = self.sample(scene, rows, self.field.samples)
-        mixed = rays.edge & (not self.field.models_background)  # with a background that only such a field models
+        mixed = rays.edge & (not self.field.models_background)  # mixed with a background that only such a field models
         error = (pixel_colour(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean())) if len(error) else None
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hnerf.fields.rays import Rays
 
-EDGE_SHARE = 1 / 3  # of the rays: half of the error is at edges, mostly in hands and feet, which are little else
+EDGE_SHARE = 1 / 3  # of the rays: half of the error is at edges, mostly in hands and feet, which are nearly all edge
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Pixels:
     """Pixels of all images, ordered by frame and camera, in host memory.
 
     starts (n + 1,): each frame's range. edges (E,), edge_starts (n + 1,): indices of the edge pixels by frame, or of
-    all pixels of a frame without any. image_starts (I + 1,): each image's range; image_camera (I,). pixel_index (P,)
+    all pixels of a frame without edges. image_starts (I + 1,): each image's range; image_camera (I,). pixel_index (P,)
     int32: row-major in the image, None if images are whole. colour, plate (P, 3) uint8; person, edge (P,) bool.
     widths_px (C,); rays_from_px (C, 3, 3); centres_m (C, 3).
     """
