@@ -70,9 +70,9 @@ class IdrField(StaticField):
     and not for the others. So IDR's masked colour loss is `mask`, its mask loss is `segmentation`, and its eikonal
     loss, at points drawn in the box, is `eikonal`.
 
-    Simplified: the mask loss has one sharpness, which the paper doubles five times; tracing is not bidirectional, the
-    samples of the mask loss show whether it overshot; networks are smaller and without weight normalisation (512 wide
-    in the paper); no camera is learned. Renders have hard silhouettes, as in the paper: a ray hits the surface or
+    Simplified: the mask loss has one sharpness, which the paper doubles five times; tracing is not bidirectional, but
+    the samples of the mask loss show whether it overshot; networks are smaller and without weight normalisation (512
+    wide in the paper); no camera is learned. Renders have hard silhouettes, as in the paper: a ray hits the surface or
     misses it.
     """
 

@@ -267,7 +267,7 @@ class PosedBodies:
         if same_posture is not None:
             theta[same_posture] = theta[same_posture].mean(0)
             own = above @ rotation_from_axis_angle(theta[:, free]) @ (above @ rotations[:, free]).transpose(-1, -2)
-            correction.turn[same_posture, :-1] = axis_angle_from_rotation(own)[same_posture]  # the turn that they got
+            correction.turn[same_posture, :-1] = axis_angle_from_rotation(own)[same_posture]  # the turn actually made
         turn, pivot = rotation_from_axis_angle(correction.turn[:, -1]), self._joints[:, 0, :3, 3]
         root[:, :3, :3] = turn @ root[:, :3, :3]
         root[:, :3, 3] = (turn @ (root[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + correction.move_m

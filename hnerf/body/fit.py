@@ -166,9 +166,9 @@ def initial_pose(capture: Capture, observations: Observations, model: BodyModel)
 
 
 def resolve_depth_flips(problem: Problem, pose: Pose, runs_of_frames: list[tuple[int, ...]]) -> Pose:
-    """Resolve limbs that are mirrored in depth: one view shows a bent limb and its mirror image alike.
+    """Resolve limbs that are mirrored in depth: in one view, a bent limb and its mirror image look the same.
 
-    A few frames in which the fit took the mirror image are outvoted by their neighbours (median filter), and the fit
+    A few frames in which the fit took the mirror image are outvoted by their neighbours (median filter), and the fit is
     repeated; the first result is kept if the cost does not fall. `runs_of_frames`: frames in order, by run.
     """
     pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
@@ -181,7 +181,7 @@ def resolve_depth_flips(problem: Problem, pose: Pose, runs_of_frames: list[tuple
 
 
 def hold_single_posture(problem: Problem, pose: Pose, posture_prior: PosturePrior) -> tuple[Pose, PosturePrior]:
-    """Hold a person who turns before the only camera to a single posture, if there is one; return the pose and the
+    """Hold a person who turns in front of the only camera to a single posture, if there is one; return the pose and the
     prior for the next stages.
 
     With a single posture all frames together determine the depth of each limb. It is accepted if keypoints and the

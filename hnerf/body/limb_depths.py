@@ -16,7 +16,7 @@ from hnerf.detection.merge import nearest_person
 # Error of the depth between two landmarks, against the truth: 45 to 130 mm, bias included, on two rendered recordings.
 DEPTH_STD_M, OUTLIER_M = 0.1, 0.3
 
-# BODY_25 keypoints and the landmark of BlazePose that each of them is: shoulders, elbows, wrists, hips, knees, ankles.
+# BODY_25 keypoints and the BlazePose landmarks that correspond to them: shoulders, elbows, wrists, hips, knees, ankles.
 LANDMARKS = {2: 12, 3: 14, 4: 16, 5: 11, 6: 13, 7: 15, 9: 24, 10: 26, 11: 28, 12: 23, 13: 25, 14: 27}
 # Limbs from the trunk, hips, shoulders. The trunk is left out: the network sees it lean back by a decimetre.
 LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (9, 10), (10, 11), (12, 13), (13, 14), (9, 12), (2, 5))

@@ -19,7 +19,7 @@ from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 LIMBS = ("thigh", "calf", "foot", "upperarm", "forearm", "hand")
 NEEDED = (PELVIS, *(f"{limb}_{side}" for side in "LR" for limb in LIMBS))
 ENDS = {"upperarm": "forearm", "forearm": "hand", "thigh": "calf", "calf": "foot"}  # of limbs whose rest poses differ
-AT_REST = {name for name in EQUIVALENTS if is_serial(name) or name.startswith(FINGERS)}  # whatever files say
+AT_REST = {name for name in EQUIVALENTS if is_serial(name) or name.startswith(FINGERS)}  # at rest whatever files say
 PREFIX = re.compile(r".*:|mixamorig\d*_?")
 
 

@@ -102,7 +102,7 @@ def retarget(own: BodyFit, motion: Motion, up: str, source: object = "motion") -
     other, names = motion.body, motion.body.rig.joint_names
     theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
     for j, name in enumerate(own.rig.joint_names):
-        if name in names:  # fingers, too, which are not free, but fitted
+        if name in names:  # this includes fingers, which are not free, but fitted
             theta[:, j] = other.theta[:, names.index(name)]
         elif own.rig.free[j]:
             raise InputError(f"{source}: has no joint {name}; use a motion that was fitted with this body model")

@@ -18,7 +18,7 @@ from hnerf.training.step import TrainingError
 RAYS = 2048
 MIN_PERSON_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
 MAX_BACKGROUND_COVERAGE = 0.8  # of the background pixels; above it the surface fills the box
-MIN_CLEAR_RAYS = 32  # of RAYS; a few tell nothing, since masks lack some of what is there
+MIN_CLEAR_RAYS = 32  # of RAYS; fewer tell nothing, since masks miss some of what is there
 MIN_SAMPLES_PER_RAY = 64  # through a whole scene: valid-wave's body covers 38 % with 16, 59 % with 64, 64 % with 256
 
 
