@@ -1,6 +1,6 @@
 """Calibrated pinhole cameras, independent of file formats.
 
-Conventions, used everywhere past the capture adapters: x_camera = R x_world + t, metres, OpenCV axes (x right, y down,
+Conventions, used everywhere after the capture adapters: x_camera = R x_world + t, metres, OpenCV axes (x right, y down,
 z forward), pixel centres at integer coordinates, linear model (images are undistorted when they are ingested).
 """
 
@@ -49,8 +49,8 @@ class Camera:
             return uv[..., :2] / uv[..., 2:], depth_m
 
     def holds(self, pixels_px: Float[np.ndarray, "*S 2"]) -> Bool[np.ndarray, "*S"]:
-        """Return whether points (x, y) lie in the image, which reaches half a pixel beyond the outer pixels' centres;
-        False for NaN."""
+        """Return whether points (x, y) lie in the image, which extends half a pixel beyond the centres of its outer
+        pixels; False for NaN."""
         (x, y), (width_px, height_px) = np.moveaxis(pixels_px, -1, 0), self.size_px
         return (x >= -0.5) & (x <= width_px - 0.5) & (y >= -0.5) & (y <= height_px - 0.5)
 
@@ -77,13 +77,14 @@ class Camera:
         return Camera(self.name, resampling(sx, sy) @ self.K, self.R, self.t_m, width_px, height_px)
 
     def scaled(self, share: float | int) -> "Camera":
-        """Return this camera with a share of the pixels along each side, at least one."""
+        """Return this camera with each side of its image scaled by `share`, to at least one pixel."""
         return self.resized(max(1, round(share * self.width_px)), max(1, round(share * self.height_px)))
 
 
 def resampling(sx: float, sy: float, left_px: float | int = 0.0, top_px: float | int = 0.0) -> Float[np.ndarray, "3 3"]:
-    """Return the matrix that takes pixels of an image to those of the image scaled by sx and sy, whose corner is then
-    put left_px and top_px into another; pixel centres are at integers, so the corner is at -0.5."""
+    """Return the matrix that maps pixels of an image to pixels of another into which it is pasted: scaled by sx and sy,
+    with its top left corner left_px and top_px from the other's. Pixel centres are at integers, so corners are at
+    -0.5."""
     return np.array([[sx, 0, left_px + (sx - 1) / 2], [0, sy, top_px + (sy - 1) / 2], [0, 0, 1]])
 
 

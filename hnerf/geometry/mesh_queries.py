@@ -1,4 +1,4 @@
-"""Queries of a triangle mesh by warp's bounding-volume hierarchy: closest points, inside or outside, and ray hits."""
+"""Queries of a triangle mesh with warp's bounding-volume hierarchy: closest points, inside or outside, and ray hits."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -8,7 +8,7 @@ import trimesh
 from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 from hnerf.warp_import import wp
 
-REACH_M = 1.0e5  # beyond any distance that is asked for; warp takes as long with it as with a few metres
+REACH_M = 1.0e5  # beyond any distance queried; warp takes no longer with it than with a few metres
 RAY_START_M = 2.0e-3  # escape rays start this far off the surface, so that they do not hit it at once
 BLOCKS = (8, 4, 2, 1)  # nodes along a side of the blocks that `Surface.occupancy` tests
 
@@ -89,9 +89,9 @@ class Surface:
     def occupancy(self, lower_m: np.ndarray, upper_m: np.ndarray, nodes: int) -> np.ndarray:
         """Return `inside` at the nodes^3 grid points of a box, bool. `nodes` is a multiple of the coarsest block.
 
-        A block is decided by its centre if no part of the surface is as near to the centre as the block's corners are;
-        other blocks are split. (The inside of an open mesh also changes away from its surface, where the winding number
-        closes a hole; a block there is decided by its centre.)
+        A block takes the value of its centre if the whole surface is farther from the centre than the block's corners
+        are; other blocks are split. (The inside of an open mesh also changes away from its surface, where the winding
+        number closes a hole; there, too, a block takes the value of its centre.)
         """
         step_m = (upper_m - lower_m) / (nodes - 1)
         occupied = np.zeros((nodes,) * 3, bool)
@@ -105,7 +105,7 @@ class Surface:
         return occupied
 
     def _flags(self, kernel: wp.Kernel, points_m: np.ndarray, *more: wp.array | float) -> np.ndarray:
-        """Return what a kernel, given points and what it needs beside them, sets for each point, (N,) bool."""
+        """Return the flag that a kernel sets for each point, (N,) bool. more: further inputs of the kernel."""
         flags = wp.zeros(len(points_m), dtype=int)
         wp.launch(kernel, len(points_m), [self._warp_mesh.id, to_vec3_array(points_m), *more, flags])
         return flags.numpy() > 0

@@ -1,4 +1,4 @@
-"""Ray casting on triangle meshes by warp's bounding-volume hierarchy."""
+"""Ray casting on triangle meshes with warp's bounding-volume hierarchy."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -39,13 +39,13 @@ class RayHits:
     distance_m: np.ndarray
 
     def interpolate(self, per_vertex: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Interpolate values at vertices (V, C) at the hits, for those rays that hit: (M, C)."""
+        """Interpolate per-vertex values (V, C) at the hits; (M, C), one row for each ray that hits."""
         hit = self.face >= 0
         return np.einsum("nk,nkc->nc", self.barycentric[hit], per_vertex[faces[self.face[hit]]])
 
 
 def mesh_on_cpu(vertices_m: np.ndarray, faces: np.ndarray) -> wp.Mesh:
-    """Return a triangle mesh (V, 3), (F, 3) for rays to be cast against on the CPU."""
+    """Return a triangle mesh (V, 3), (F, 3) for ray casting on the CPU."""
     corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
     return wp.Mesh(to_vec3_array(vertices_m, "cpu"), corners)
 

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 
 from hnerf.geometry.camera import Camera
 
-NEAREST_PERCENT = 1  # percentile of vertex depths that sets the radius: one finger does not widen all discs
-FARTHEST_PX = 1e5  # of a corner, as OpenCV fills polygons of small integers
+NEAREST_PERCENT = 1  # percentile of vertex depths that sets the radius, so that one finger does not widen all discs
+FARTHEST_PX = 1e5  # largest coordinate of a corner; OpenCV fills polygons of small integers only
 ReachablePixels = Callable[[Camera, Float[np.ndarray, "V 3"]], Bool[np.ndarray, "H W"]]
 """Returns which pixels of a camera can show any part of a body with these vertices."""
 
@@ -22,7 +22,7 @@ def everywhere(camera: Camera, vertices_m: Float[np.ndarray, "V 3"]) -> Bool[np.
 
 def within_box(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], margin_m: float) -> Bool[np.ndarray, "H W"]:
     """Return the pixels whose rays meet the bounding box of the body with a margin; all pixels if part of the box lies
-    behind the camera, or all but touches its plane."""
+    behind the camera or nearly in its plane."""
     lower_m, upper_m = vertices_m.min(0) - margin_m, vertices_m.max(0) + margin_m
     corners_px, depth_m = camera.project(np.array(list(itertools.product(*zip(lower_m, upper_m, strict=True)))))
     if depth_m.min() <= 0 or np.abs(corners_px).max() > FARTHEST_PX:
@@ -35,10 +35,10 @@ def within_box(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], margin_m: f
 def within_reach(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], reach_m: float) -> Bool[np.ndarray, "H W"]:
     """Return the pixels whose rays pass within about `reach_m` of the body.
 
-    The ray through p passes a point at depth z that projects to v at a distance of at least z |p - v| cos(a), where p
-    and v are in focal lengths and the ray is at an angle a from the axis: equal if p, v and the middle lie on a line.
-    So each vertex in front of the camera, in the image or beside it, covers the pixels closer than reach_m / (z
-    cos(a)), with the z of the nearest vertices for all.
+    Take a point at depth z that projects to v, and the ray through pixel p, at an angle a from the optical axis. Their
+    distance is at least z |p - v| cos(a), with p and v in focal lengths; it is equal if p, v and the principal point
+    are collinear. So each vertex in front of the camera, inside or outside the image, covers the pixels closer than
+    reach_m / (z cos(a)); the z of the nearest vertices is used for all.
     """
     size_px = np.array(camera.size_px)
     xy, depth_m = camera.project(vertices_m)

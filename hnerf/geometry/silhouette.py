@@ -5,7 +5,7 @@ import numpy as np
 from hnerf.geometry.camera import Camera
 from hnerf.warp_import import wp
 
-NEAR_M = 1e-3  # least depth of a vertex; triangles with a nearer one are not drawn
+NEAR_M = 1e-3  # minimum depth of a vertex; triangles with a nearer vertex are not drawn
 
 
 @wp.func
@@ -38,7 +38,7 @@ def silhouette(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> np.
     """Return the silhouette of a mesh, (H, W) bool: True where the ray through the pixel's centre meets a triangle.
 
     vertices_m (V, 3) world; faces (F, 3). Evaluates edge functions (Pineda 1988) at the pixel centres of each
-    triangle's box. Triangles that reach behind the camera are left out.
+    triangle's bounding box. Triangles that reach behind the camera are not drawn.
     """
     uv, depth_m = camera.project(np.asarray(vertices_m, np.float64))
     image = wp.zeros((camera.height_px, camera.width_px), dtype=wp.uint8, device="cpu")

@@ -7,21 +7,21 @@ from jaxtyping import Bool, Float
 
 CHUNK = 1 << 14  # points triangulated at once, to bound memory
 MIN_INLIER_PX = 3.0
-DAMPING = 1e-12  # of the normal equations' trace: keeps them solvable for parallel rays, which then meet far away
+DAMPING = 1e-12  # share of the normal equations' trace: keeps them solvable for parallel rays, which then meet far away
 
 
 def triangulate(
     projections: Float[np.ndarray, "C 3 4"], keypoints: Float[np.ndarray, "C K 3"]
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "C K"], Bool[np.ndarray, "C K"]]:
-    """Triangulate points from several views, leaving outlier views out.
+    """Triangulate points from several views, excluding outlier views.
 
-    keypoints: x_px, y_px, confidence (0: unseen). For each point, every pair of views
-    is solved linearly; the solution nearest to all views (confidence-weighted L1) decides which views are inliers. The
-    inliers are then solved together by the iteratively re-weighted linear method (Hartley and Sturm 1997). They are
-    nearer than 4 times the median distance of the views that took no part in a pair's solution: it grows with noise and
-    calibration error.
+    keypoints: x_px, y_px, confidence (0: unseen). For each point, every pair of views is solved linearly; the solution
+    nearest to all views (confidence-weighted L1) decides which views are inliers. The inliers are then solved together
+    by the iteratively re-weighted linear method (Hartley and Sturm 1997). An inlier is nearer than 4 times the median
+    distance of the views that took no part in a pair's solution, a median that grows with noise and calibration error.
 
-    Returns points_m, NaN with fewer than two inlier views; residuals_px, NaN where unseen or without a point; inliers.
+    Returns points_m (NaN with fewer than two inlier views), residuals_px (NaN where unseen or without a point) and
+    inliers.
     """
     confidence = confidence_of(keypoints)
     best = [_best_pair(projections, keypoints[:, i : i + CHUNK], confidence[:, i : i + CHUNK])
@@ -47,7 +47,7 @@ def confidence_of(keypoints: Float[np.ndarray, "*S 3"]) -> Float[np.ndarray, "*S
 
 
 def _best_pair(projections: np.ndarray, keypoints: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each point the two-view solution nearest to all views, (K, 3), and which views made it, (C, K)
+    """Return for each point the two-view solution nearest to all views, (K, 3), and which views it used, (C, K)
     bool."""
     cameras, count = confidence.shape
     best_cost = np.full(count, np.inf)
@@ -70,10 +70,11 @@ def solve_points(
     """Triangulate linearly with weights, re-weighted once by depth so that pixel distances are minimised.
 
     Returns points in metres, NaN with fewer than two views. Hartley and Sturm 1997, section 5.2, "Iterative-LS":
-    inhomogeneous normal equations, which do not depend on where the origin is.
+    inhomogeneous normal equations, whose solution does not depend on the choice of origin.
     """
     rows = projections[:, None, 2:] * np.nan_to_num(keypoints)[..., :2, None] - projections[:, None, :2]  # (C, K, 2, 4)
-    # With the principal point in it, so lenses that differ there weigh unlike: 0.3 % more error beside a quarter crop.
+    # Includes the principal point, so lenses that differ in it get different weights: 0.3 % more error next to a
+    # quarter crop.
     focal = np.linalg.norm(projections[:, :2, :3], axis=-1).mean(1)
     outer = np.einsum("ckia,ckib->ckab", rows, rows) / focal[:, None, None, None] ** 2
     scale = np.where(weights > 0, np.sqrt(weights), 0)
@@ -91,7 +92,7 @@ def solve_points(
 def reprojection_px(
     projections: Float[np.ndarray, "C 3 4"], points_m: Float[np.ndarray, "K 3"], keypoints: Float[np.ndarray, "C K 3"]
 ) -> Float[np.ndarray, "C K"]:
-    """Return the image distance of points to keypoints; NaN behind a camera."""
+    """Return the distance in pixels between projected points and keypoints; NaN behind a camera."""
     x = np.einsum("cij,kj->cki", projections, np.concatenate([points_m, np.ones_like(points_m[:, :1])], 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.linalg.norm(x[..., :2] / x[..., 2:] - keypoints[..., :2], axis=-1)
