@@ -1,4 +1,4 @@
-"""Black bars: where the calibrated picture lies within a recorded one."""
+"""Black bars: where the calibrated picture lies within a recorded image."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ from hnerf.capture.lens import Lens
 from hnerf.geometry.camera import resampling
 
 DARK = 16.0  # grey level: nine tenths of each row of a bar are below it
-LIT = 40.0  # grey level: the median of the picture beside a bar must be above it, so that the edge shows
-MAX_BAR_SHARE = 0.4  # of the picture's side, for each of its two bars
-RISE_PX = 3  # width of the step from a bar to the picture at most; an encoder blurs it over two
-BAND_ROWS = 256  # of the pictures, handled at once: floats of whole ones would take gigabytes
-ASPECT_PX = 1.0  # by which the picture's height may differ from what its width implies
+LIT = 40.0  # grey level: the median of the picture next to a bar must be above it, so that the edge shows
+MAX_BAR_SHARE = 0.4  # of the image's side, for each of the two bars across it
+RISE_PX = 3  # maximum width of the step from a bar to the picture; an encoder blurs it over two pixels
+BAND_ROWS = 256  # image rows processed at once: whole images as floats would take gigabytes
+ASPECT_PX = 1.0  # tolerated difference between the picture's height and what its width implies
 
 
 class Area(NamedTuple):
@@ -30,7 +30,7 @@ class Area(NamedTuple):
 def picture_area(pictures: Sequence[np.ndarray]) -> Area:
     """Return the part of one camera's frames (H, W, 3) uint8 that is not black bars, to a fraction of a pixel.
 
-    A bar is dark in all frames and ends sharply; a picture that fades into the dark has none.
+    A bar is dark in all frames and has a sharp edge; an image that fades to black has no bar.
     """
     starts = range(0, len(pictures[0]), BAND_ROWS)
     bands = ([picture[row : row + BAND_ROWS].mean(-1, dtype=np.float32) for picture in pictures] for row in starts)
@@ -42,11 +42,11 @@ def picture_area(pictures: Sequence[np.ndarray]) -> Area:
 
 
 def lens_for_area(lens: Lens, area: Area, recorded_px: tuple[int, int]) -> Lens | None:
-    """Return the lens of a camera whose picture was scaled into `area` of the recorded one; None where nothing proves
+    """Return the lens of a camera whose picture was scaled into `area` of the recorded image; None without proof of
     that.
 
-    The proof is bars, and between them the calibrated aspect ratio to a pixel. Distortion coefficients are in units of
-    the focal length and do not change.
+    The proof is black bars and, between them, the calibrated aspect ratio to within a pixel. Distortion coefficients
+    are in units of the focal length and do not change.
     """
     assert lens.size_px is not None
     sx, sy = area.width / lens.size_px[0], area.height / lens.size_px[1]
@@ -56,8 +56,8 @@ def lens_for_area(lens: Lens, area: Area, recorded_px: tuple[int, int]) -> Lens 
 
 
 def _bar_px(grey: np.ndarray) -> float:
-    """Return the height of the bar at the top of a picture (H, W), up to where half the light is reached; 0 without a
-    bar."""
+    """Return the height of the bar at the top of a grey image (H, W), up to half of the picture's brightness; 0 without
+    a bar."""
     limit = int(MAX_BAR_SHARE * len(grey))
     bright = np.flatnonzero(np.percentile(grey[:limit], 90, axis=1) >= DARK)
     if len(bright) == 0 or bright[0] == 0:

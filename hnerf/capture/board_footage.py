@@ -24,7 +24,7 @@ from hnerf.capture.normalise import Normaliser
 from hnerf.config import validated
 from hnerf.errors import InputError
 
-MAX_FRAMES = 200  # of each camera in which the board is searched, evenly strided
+MAX_FRAMES = 200  # evenly strided frames of each camera in which the board is searched for
 MAX_TABLE_BYTES = 2_000_000  # of timestamps.csv: a hundred thousand rows
 BOARDS_FILE = "boards.npz"
 METRES = {"inch": 0.0254, "cm": 0.01}
@@ -33,7 +33,7 @@ log = logging.getLogger("hnerf.capture")
 
 
 class Board(BaseModel):
-    """A flat board of squares: ChArUco, or a plain checkerboard where there is no dictionary of markers.
+    """A flat board of squares: ChArUco, or a plain checkerboard without a marker dictionary.
 
     `marker_share`: side of a marker relative to a square's; `inverted`: printed white on black.
     """
@@ -62,7 +62,7 @@ class BoardDetector:
         self.charuco = None
         if board.dictionary:
             parameters = cv2.aruco.CharucoParameters()
-            parameters.minMarkers = 1  # corners beside a hand keep one of their two markers; bad ones are dropped later
+            parameters.minMarkers = 1  # a hand may hide one of a corner's two markers; bad corners are dropped later
             dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
             size, marker_m = (board.columns, board.rows), board.marker_share * board.square_m
             squares = cv2.aruco.CharucoBoard(size, board.square_m, marker_m, dictionary)
@@ -82,9 +82,9 @@ class BoardDetector:
         return corners_px
 
     def _checkerboard(self, grey: np.ndarray) -> np.ndarray:
-        """Return all corners or none, beginning with the same corner whichever way the board is held.
+        """Return all corners, or only NaN; they start at the same physical corner however the board is held.
 
-        `read_board` admits only boards whose first and last square differ in colour: the black one is the first.
+        `read_board` accepts only boards whose first and last square differ in colour; the black one is first.
         """
         columns, rows = self.board.columns - 1, self.board.rows - 1
         found, corners_px = cv2.findChessboardCornersSB(grey, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
@@ -150,7 +150,7 @@ def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]
 
 
 def load_board_corners(root: Path) -> BoardCorners | None:
-    """Load the board corners of a normalised capture; None where the recording has no footage of a board."""
+    """Load the board corners of a normalised capture; None if the recording has no footage of a board."""
     if not (root / BOARDS_FILE).exists():
         return None
     with np.load(root / BOARDS_FILE, allow_pickle=False) as stored:
@@ -180,13 +180,13 @@ def read_board(folder: Path) -> Board | None:
 def read_board_footage(
     folder: Path, part: Literal["extrinsic", "intrinsic"], wanted: int | None = None
 ) -> BoardFootage | None:
-    """Return the corners in the footage of calibration/<part>/; None where there is no footage or no board is
+    """Return the corners in the footage of calibration/<part>/; None if there is no footage or no board is
     described.
 
-    In long footage only every n-th frame is examined, including frame `wanted` if it is given. In extrinsic footage all
-    cameras' images of one frame number are assumed to be simultaneous; videos are numbered by Caliscope's
-    `timestamps.csv` if there is one. Raises InputError on files that cannot be read or do not match, or where there is
-    no frame `wanted`.
+    In long footage only every n-th frame is examined, including frame `wanted` if it is given. In extrinsic footage,
+    images with the same frame number are assumed to be simultaneous in all cameras; videos are numbered by Caliscope's
+    `timestamps.csv` if there is one. Raises InputError on files that cannot be read or do not match, or if there is no
+    frame `wanted`.
     """
     path = safe_io.path_in_capture(folder, "calibration", part)
     footage, board = _footage(folder, part), read_board(folder)
@@ -211,8 +211,8 @@ def read_board_footage(
 def _corners(
     board: Board, pictures: Footage, numbers: tuple[int, ...], frames: tuple[int, ...]
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the corners of one camera, (frames, N, 2), and the size of its images. numbers: the common frame numbers
-    of its own frames."""
+    """Return the corners of one camera, (frames, N, 2), and the size of its images. numbers: for each of the camera's
+    own frames, its number common to all cameras."""
     detector, size_px = BoardDetector(board), None
     corners_px = np.full((len(frames), len(board.corners_m), 2), np.nan)
     row = {frame: i for i, frame in enumerate(frames)}
@@ -241,7 +241,7 @@ def _check_markers(source: Path, board: Board) -> None:
 
 
 def _from_caliscope(path: Path) -> dict[str, Any]:
-    """Convert Caliscope's charuco.toml to keys of `Board`; a size measured on the print overrides that of the page."""
+    """Convert Caliscope's charuco.toml to keys of `Board`; a measured square size overrides the page's."""
     table = safe_io.read_toml(path)
     try:
         square_m = 0.01 * float(table.get("square_size_override_cm") or 0)
@@ -283,7 +283,7 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
 
 
 def _frame_numbers(root: Path, footage: dict[str, Footage], synchronised: bool) -> dict[str, tuple[int, ...]]:
-    """Return for each camera the common number of each of its frames."""
+    """Return, by camera, the number of each of its frames that is common to all cameras."""
     stamps = safe_io.path_in_capture(root, "timestamps.csv")
     if not synchronised or not stamps.exists():
         videos = [pictures for pictures in footage.values() if isinstance(pictures, Video)]

@@ -1,4 +1,4 @@
-"""Boxes of MP4 and QuickTime, of which videos are made (ISO/IEC 14496-12)."""
+"""Boxes, the building blocks of MP4 and QuickTime files (ISO/IEC 14496-12)."""
 
 import re
 from collections.abc import Iterator
@@ -6,25 +6,25 @@ from pathlib import Path
 
 from hnerf.errors import InputError
 
-MAX_TABLES_BYTES = 1 << 28  # of boxes with tables of samples; days of video
-MAX_REPEATS = 10  # of samples, by edits, as often as the file has bytes
+MAX_TABLES_BYTES = 1 << 28  # size of the boxes with sample tables; enough for days of video
+MAX_REPEATS = 10  # samples times edits, per byte of the file
 NO_TABLES = (b"mdat", b"free", b"skip", b"wide")
-HEADERS = (b"mvhd", b"cmov")  # FFmpeg takes a box that begins with one of them for the header, whatever it is called
+HEADERS = (b"mvhd", b"cmov")  # FFmpeg treats a box that begins with one of them as the header, whatever its kind
 COMPRESSED = re.compile(rb"cmov.{4}dcom", re.DOTALL)
-SAMPLES = re.compile(rb"stsz(?=.{8}(.{4}))", re.DOTALL)  # takes up the name alone: other bytes may hold the next one
+SAMPLES = re.compile(rb"stsz(?=.{8}(.{4}))", re.DOTALL)  # consumes the name only: what follows may hold the next
 FRAGMENT_SAMPLES = re.compile(rb"trun(?=.{4}(.{4}))", re.DOTALL)
 EDITS = re.compile(rb"elst(?=.{4}(.{4}))", re.DOTALL)
 
 
 def movie_boxes(path: Path, most_bytes: int) -> list[tuple[bytes, bytes]]:
-    """Return kind and content of the boxes in a file's first `moov`; none where there is none, or a larger one."""
+    """Return kind and content of the boxes in a file's first `moov`; none without a `moov`, or if it is larger."""
     movies = ((start, size_bytes) for kind, start, size_bytes in _top_boxes(path) if kind == b"moov")
     start, size_bytes = next(movies, (0, 0))
     return list(boxes(_content(path, start, size_bytes))) if size_bytes <= most_bytes else []
 
 
 def boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield kind and content of the boxes that follow each other; nothing from where their sizes stop making sense."""
+    """Yield kind and content of consecutive boxes, up to the first implausible size."""
     at = 0
     while at + 8 <= len(content):
         size = int.from_bytes(content[at : at + 4], "big")
@@ -35,9 +35,9 @@ def boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def check_tables(path: Path) -> None:
-    """Raise InputError for a video of which FFmpeg would make tables that are much larger than its own: it declares
-    more samples than it has bytes, repeats them in many edits, or has a compressed header. Wherever that is among its
-    boxes, it counts."""
+    """Raise InputError for a video from which FFmpeg would build tables much larger than the file's own: one that
+    declares more samples than it has bytes, repeats them in many edits, or has a compressed header, in whichever of its
+    boxes."""
     tables_bytes, samples, fragments, edits = 0, 0, 0, 0
     for kind, start, size_bytes in _top_boxes(path):
         if kind in NO_TABLES and _content(path, start, 8)[4:] not in HEADERS:
@@ -61,7 +61,7 @@ def check_tables(path: Path) -> None:
 
 
 def _top_boxes(path: Path) -> Iterator[tuple[bytes, int, int]]:
-    """Yield kind, start and size of the content of a file's outer boxes; nothing from where sizes stop making sense."""
+    """Yield kind, content start and content size of a file's outer boxes, up to the first implausible size."""
     at, end = 0, path.stat().st_size
     with path.open("rb") as file:
         while len(head := file.read(8)) == 8:

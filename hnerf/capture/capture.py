@@ -1,8 +1,8 @@
 """The normalised capture that every later stage reads.
 
-A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted), and where the
-recording has them `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz` and
-`poses.npz`; where a network looked for people `person/<camera>/<frame:06d>.png`, and for hands `hands.npz`.
+A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted) and, if the
+recording has them, `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz` and
+`poses.npz`; if a network detected people, `person/<camera>/<frame:06d>.png`; if one detected hands, `hands.npz`.
 """
 
 import dataclasses
@@ -44,12 +44,12 @@ class Capture:
     """A normalised capture: cameras, frames, splits and where the images lie. Test cameras are for scoring only.
 
     `calibrated_sizes_px`: per camera the (width, height) at which the calibration was made; `recorded_sizes_px`: the
-    (width, height) of the recorded files; `picture_areas_px`: where black bars prove that the calibrated picture lies
-    within the recorded one, which changed K on ingestion. `up`: "z" or "y", the world's vertical axis. `frame_offsets`:
-    of cameras that are not synchronised (hnerf.capture.timing); `stored_frames`: the frames in the files, where some
-    were dropped since; `frame_step`: the distance of frame numbers in the recording. `recorded_lenses`: K and
-    distortion of the recorded files, of cameras that were undistorted. `subject_point`: None where nobody is named.
-    `stature_m`: the person's, where `capture.toml` states it.
+    (width, height) of the recorded files; `picture_areas_px`: the part of the recorded image that the calibrated
+    picture fills, if black bars prove it; ingestion changed K accordingly. `up`: "z" or "y", the world's vertical axis.
+    `frame_offsets`: of cameras that are not synchronised (hnerf.capture.timing); `stored_frames`: the frames in the
+    files, if some were dropped since; `frame_step`: the distance of frame numbers in the recording. `recorded_lenses`:
+    K and distortion of the recorded files, for cameras that were undistorted. `subject_point`: None if nobody is named.
+    `stature_m`: the person's, if `capture.toml` states it.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Capture:
         return read_rgb(found[0])
 
     def background(self, camera: str) -> np.ndarray | None:
-        """Read the clean plate, (H, W, 3) uint8 RGB; None where the recording has none."""
+        """Read the clean plate, (H, W, 3) uint8 RGB; None if the recording has none."""
         found = list((self.root / "background").glob(f"{camera}.*"))
         return read_rgb(found[0]) if found else None
 
@@ -94,14 +94,14 @@ class Capture:
         return self._grey_path("masks", camera, frame).exists()
 
     def given_mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """Read the given mask recorded nearest in time to a frame, (H, W) bool, True on the person; None where there is
+        """Read the given mask recorded nearest in time to a frame, (H, W) bool, True on the person; None if there is
         none."""
         mask = self._grey("masks", camera, frame, "write it again or delete it")
         return None if mask is None else mask > 127
 
     def person_probability(self, camera: str, frame: int) -> np.ndarray | None:
-        """Return a network's probability that a pixel shows a person, (H, W) float32; None if no network looked. It is
-        that of the recorded frame nearest in time."""
+        """Return a network's probability that a pixel shows a person, (H, W) float32, in the recorded frame nearest in
+        time; None if no network was run."""
         likely = self._grey(PERSON, camera, frame, "detect again")
         return None if likely is None else likely.astype(np.float32) / 255
 
@@ -119,19 +119,19 @@ class Capture:
         """Return BODY_25 keypoints (frames, people, 25, 3) x_px, y_px, confidence in the order of `frames`; all 0 where
         absent.
 
-        They are interpolated between recorded frames where the camera is not synchronised.
+        They are interpolated between recorded frames if the camera is not synchronised.
         """
         return self._points(KEYPOINTS, camera)
 
     def hands(self, camera: str) -> np.ndarray | None:
-        """Return the subject's left and right hand (frames, 2, 21, 3) in the order of `keypoints`; None where no
-        network looked for hands."""
+        """Return the subject's left and right hand (frames, 2, 21, 3) in the order of `keypoints`; None if no network
+        was run to find hands."""
         return self._points(HANDS, camera)
 
     def landmarks(self, camera: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return a network's landmarks of people (frames, people, 33, 3), in the order of `frames` and each recorded
-        nearest in time: x_px, y_px and confidence; and metres from the middle of the hips along the camera's axes. None
-        where no network looked."""
+        """Return a network's landmarks of people (frames, people, 33, 3) in the order of `frames`, each from the
+        recorded frame nearest in time: x_px, y_px and confidence; and metres from the midpoint of the hips along the
+        camera's axes. None if no network was run."""
         path = self.root / LANDMARKS / f"{camera}.npz"
         if not path.exists():
             return None
@@ -159,12 +159,12 @@ class Capture:
 
     @property
     def has_person_masks(self) -> bool:
-        """Return whether there are a network's person masks for all training cameras."""
+        """Return whether all training cameras have person masks from a network."""
         return all((self.root / PERSON / camera).is_dir() for camera in self.train_cameras)
 
     def given_poses(self) -> GivenPoses | None:
-        """Return the poses of a body model that come with the recording, a row for each of `frames`; None where none of
-        these has one."""
+        """Return the poses of a body model that come with the recording, a row for each of `frames`; None if no frame
+        has one."""
         path = self.root / "poses.npz"
         if not path.exists():
             return None
@@ -178,9 +178,9 @@ class Capture:
         return dataclasses.replace(self, cameras=cameras)
 
     def synchronised(self, frame_offsets: dict[str, float]) -> "Capture":
-        """Return the same recording with these frame offsets, without frames that one of the cameras did not record.
+        """Return the same recording with these frame offsets, without the frames that any camera did not record.
 
-        Where that would drop most frames, because those between were not ingested, the nearest ingested ones are used
+        If that would drop most frames because frames in between were not ingested, the nearest ingested ones are used
         instead.
         """
         stored = self.stored_frames or self.frames
@@ -230,15 +230,16 @@ class Capture:
 
 
 def _camera(source: Path, name: str, described: dict[str, Any]) -> Camera:
-    """Return a camera as a file describes it. Raises ValueError, InputError or others if it is none."""
+    """Return the camera that a file describes. Raises ValueError, InputError or others if the description is
+    invalid."""
     K, R, t_m = (np.array(described[key]) for key in ("K", "R", "t_m"))
     lens = checked_lens((source, source), name, K, np.zeros(4), R, t_m, None)
     return Camera(name, lens.K, lens.R, lens.t_m, *check_image_size(source, *described["size_px"]))
 
 
 def checked_capture(capture: Capture) -> Capture:
-    """Return a capture as it is. Raises ValueError unless it has training cameras, all its cameras are known, it has a
-    frame rate, and a vertical axis."""
+    """Return the capture unchanged. Raises ValueError unless it has training cameras, all its cameras are known, and
+    its frame rate and vertical axis are valid."""
     if not capture.train_cameras or not {*capture.train_cameras, *capture.test_cameras} <= capture.cameras.keys():
         raise ValueError("no training camera, or an unknown camera")
     if not MIN_FPS <= capture.fps <= MAX_FPS:
@@ -266,8 +267,8 @@ def read_rgba(path: Path) -> np.ndarray:
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    """Write an image, grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), in the format of the file's suffix; its folder is
-    made if need be. JPEG is written without chroma subsampling. Raises OSError if the file cannot be written."""
+    """Write an image, grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), in the format of the file's suffix; create its
+    folder if needed. JPEG is written without chroma subsampling. Raises OSError if the file cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     colour = pixels.ndim == 3
     as_stored = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], -1) if colour else np.ascontiguousarray(pixels)

@@ -1,6 +1,6 @@
-"""Cameras that started at other times, record at other rates or whose clocks drift: their footage, in step.
+"""Synchronised footage of cameras that started at different times, record at different rates or have drifting clocks.
 
-`clocks.toml` in the capture's folder says how each camera's own time follows from that of all:
+`clocks.toml` in the capture's folder gives each camera's own time as a function of the common time t:
 t_own = (1 + drift_ppm / 10^6) t + offset_s.
 """
 
@@ -20,8 +20,8 @@ from hnerf.config import validated
 from hnerf.errors import InputError
 
 FILE = "clocks.toml"
-IRREGULAR = 0.5  # of a frame's duration: by which a video's frames may be off an even rate
-NOTICED_S = 0.1  # off an even rate, beyond which motion looks too fast or too slow
+IRREGULAR = 0.5  # of a frame's duration: how far a video's frames may be off an even rate
+NOTICED_S = 0.1  # deviation from an even rate beyond which motion looks too fast or too slow
 
 log = logging.getLogger("hnerf.capture")
 
@@ -42,8 +42,8 @@ class _ClockTable(BaseModel):
 
 @dataclass(frozen=True)
 class InStep:
-    """Footage of one camera at the instants of all. own: by instant, counted as the frame numbers of the slowest
-    camera, the camera's own frame number, with its fraction; fps: of the slowest camera, where its file says."""
+    """Footage of one camera at the common instants, which are frame numbers of the slowest camera. own: the camera's
+    own fractional frame number at each instant; fps: of the slowest camera, if its file states it."""
 
     source: ImageFolder | Video
     own: dict[int, float]
@@ -74,7 +74,7 @@ class InStep:
         for instant in wanted:
             while image is not None and image.frame != nearest[instant]:
                 image = next(images, None)
-            assert image is not None  # `read` yields all that it was asked for
+            assert image is not None  # `read` yields every frame requested
             yield VideoFrame(instant, image.rgb, image.file)
 
     def resampled(self, people: np.ndarray) -> np.ndarray:
@@ -106,11 +106,12 @@ def write_clocks(path: Path, clocks: Mapping[str, Clock]) -> None:
 def in_step(
     footage: dict[str, ImageFolder | Video], clocks: Mapping[str, Clock], fps: float
 ) -> dict[str, ImageFolder | Video | InStep]:
-    """Return the footage of all cameras at common instants: the frames of the slowest camera that all recorded; of
-    cameras that are equally slow, the first whose frames come evenly, so that their numbers tell the time.
+    """Return the footage of all cameras at common instants: the frames of the slowest camera that all cameras recorded.
+    Of equally slow cameras, the first with evenly spaced frames is taken, so that its frame numbers tell the time.
 
-    It is the same footage where there are no clocks and no video says that its frames come at an uneven rate. fps: of
-    images without a rate of their own. Raises InputError where a clock is missing, or the recordings do not overlap.
+    The footage is returned unchanged if there are no clocks and no video states that its frames are unevenly spaced.
+    fps: of images without a rate of their own. Raises InputError if a clock is missing or the recordings do not
+    overlap.
     """
     times_s = {name: frame_times_s(one, fps) for name, one in footage.items()}
     uneven = any(
@@ -138,7 +139,7 @@ def in_step(
 
 
 def warn_if_uneven(one: ImageFolder | Video) -> None:
-    """Warn of a video by itself whose frames, which count as evenly spaced, are not."""
+    """Warn if the frames of a single video, which are treated as evenly spaced, are not."""
     if isinstance(one, Video) and one.times_s and (off_s := _unevenness_s(np.asarray(one.times_s))) > NOTICED_S:
         log.warning(
             "%s: frames come up to %.1f s off an even rate, by which they count: motion is too fast or too slow in "
@@ -149,7 +150,7 @@ def warn_if_uneven(one: ImageFolder | Video) -> None:
 
 
 def frame_times_s(footage: ImageFolder | Video, fps: float) -> np.ndarray:
-    """Return when each frame was recorded, in seconds on the camera's own clock: as a video says, else at an even
+    """Return when each frame was recorded, in seconds on the camera's own clock: as a video states, else at an even
     rate."""
     if isinstance(footage, Video) and footage.times_s:
         return np.asarray(footage.times_s)
@@ -170,8 +171,8 @@ def _unevenness_s(times_s: np.ndarray) -> float:
 
 
 def _frames_at(frames: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:
-    """Return the frame numbers with fractions at times; NaN beyond half a frame from the nearest one: before the first,
-    after the last, and where frames are missing."""
+    """Return the fractional frame numbers at given times; NaN more than half a frame from the nearest frame: before the
+    first, after the last, and where frames are missing."""
     step_s, position = _step_s(times_s), np.interp(wanted_s, times_s, np.arange(len(times_s)))
     before_s, after_s = (times_s[rounded(position).astype(int)] for rounded in (np.floor, np.ceil))
     off_s = np.minimum(np.abs(wanted_s - before_s), np.abs(wanted_s - after_s))

@@ -1,6 +1,6 @@
-"""Edit lists of MP4 and QuickTime: which frames players show of a video that was trimmed without being encoded again.
+"""Edit lists of MP4 and QuickTime: the frames that players show of a video trimmed without re-encoding.
 
-Trimmed videos begin with the key frame before the cut; the edit list says from when to when they are shown.
+Such a video begins with the key frame before the cut; the edit list gives the time range to show.
 """
 
 import struct
@@ -16,8 +16,8 @@ INSIDE = (b"mdia", b"minf", b"stbl", b"edts")
 
 
 def shown_frames(path: Path, samples: int) -> int:
-    """Return how many frames FFmpeg shows of a video's track of this many samples: those within its edit list; all
-    where it has none that can be read."""
+    """Return how many frames FFmpeg shows of a video's track with this many samples: those within its edit list; all if
+    it has no readable edit list."""
     movie = movie_boxes(path, MAX_TABLES_BYTES)
     tracks = [_leaves(content) for kind, content in movie if kind == b"trak"]
     videos = [track for track in tracks if track.get(b"hdlr", b"")[8:12] == b"vide"]
@@ -29,7 +29,7 @@ def shown_frames(path: Path, samples: int) -> int:
 
 
 def _leaves(content: bytes) -> dict[bytes, bytes]:
-    """Return the boxes of a track that matter here; of two of a kind the outer one."""
+    """Return the boxes of a track that matter here; of two boxes of one kind, the outer one."""
     found = dict(boxes(content))
     for kind in INSIDE:
         found = dict(boxes(found.get(kind, b""))) | found
@@ -37,8 +37,8 @@ def _leaves(content: bytes) -> dict[bytes, bytes]:
 
 
 def _edits(mvhd: bytes, track: dict[bytes, bytes]) -> list[tuple[int, int]]:
-    """Return begin and end of each edit that shows something, in the units of the track. Raises ValueError if there are
-    too many."""
+    """Return the start and end of each edit that shows something, in the track's time units. Raises ValueError if there
+    are too many."""
     elst, rate, movie_rate = track[b"elst"], _time_scale(track[b"mdhd"]), _time_scale(mvhd)
     count, entry = _number(elst[4:8]), struct.Struct(">QqI" if elst[0] else ">IiI")
     if not 0 < count <= MAX_EDITS:
@@ -49,14 +49,15 @@ def _edits(mvhd: bytes, track: dict[bytes, bytes]) -> list[tuple[int, int]]:
 
 
 def _shown_at(track: dict[bytes, bytes], samples: int) -> np.ndarray:
-    """Return when each sample is shown, ascending, in the units of the track. Raises ValueError if it does not say."""
+    """Return the display time of each sample, ascending, in the track's time units. Raises ValueError on a wrong
+    table."""
     lasts = _expanded(track[b"stts"], ">u4", samples)
     offsets = _expanded(track[b"ctts"], ">i4", samples) if b"ctts" in track else 0
     return np.sort(np.cumsum(lasts) - lasts + offsets)
 
 
 def _expanded(table: bytes, number: str, samples: int) -> np.ndarray:
-    """Return the number of each sample from a table of runs. Raises ValueError if it is of another count of samples."""
+    """Expand a run-length table to one number per sample. Raises ValueError if it covers another count of samples."""
     runs = np.frombuffer(table[8:], np.dtype([("count", ">u4"), ("number", number)]), _number(table[4:8]))
     if runs["count"].sum(dtype=np.int64) != samples:
         raise ValueError("another number of samples")
@@ -68,7 +69,7 @@ def _within(edits: list[tuple[int, int]], shown_at: np.ndarray) -> int:
 
 
 def _time_scale(header: bytes) -> int:
-    """Return the units a second of a header of a movie or a track."""
+    """Return the time units per second in the header of a movie or a track."""
     at = 20 if header[0] else 12
     return _number(header[at : at + 4])
 

@@ -18,13 +18,13 @@ from hnerf.progress import report
 
 # Our own message, one line, replaces what OpenCV and FFmpeg would print about a bad video.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-# MP4 and QuickTime, whatever the file is called: others, such as playlists, make FFmpeg read further files.
+# Only MP4 and QuickTime, whatever the file's name: other formats, such as playlists, make FFmpeg read further files.
 os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "format_whitelist;mov"
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 PROGRESS_FRAMES = 100  # between two reports
-MIN_FPS, MAX_FPS = 0.01, 10_000.0  # that a recording can have
+MIN_FPS, MAX_FPS = 0.01, 10_000.0  # of a recording
 
 
 class VideoFrame(NamedTuple):
@@ -56,8 +56,8 @@ class ImageFolder:
 
 @dataclass(frozen=True)
 class Video:
-    """A video file whose every frame can be decoded, numbered from 0; without those that its edit list does not show.
-    times_s: when each is shown, where the file says."""
+    """A video file of which every frame can be decoded. frames: numbered from 0, without those that its edit list
+    hides; times_s: when each is shown, if the file states it."""
 
     path: Path
     frames: tuple[int, ...]
@@ -66,8 +66,8 @@ class Video:
 
     @staticmethod
     def open(path: Path) -> "Video":
-        """Open a video and count its frames by decoding: its header is no proof (a codec may be missing, the file cut
-        short)."""
+        """Open a video and count its frames by decoding: the header proves nothing (a codec may be missing, the file
+        may be truncated)."""
         stream = _open_stream(path)
         check_image_size(path, stream.get(cv2.CAP_PROP_FRAME_WIDTH), stream.get(cv2.CAP_PROP_FRAME_HEIGHT))
         declared, times_s = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), list[float]()

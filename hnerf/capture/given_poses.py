@@ -9,11 +9,11 @@ import numpy as np
 from hnerf.errors import InputError
 
 JOINTS, BETAS = 24, 10  # of SMPL
-MAX_TURN_RAD, MAX_MOVE_M, MAX_BETA = 1e3, 1e6, 1e2  # beyond them, no fit has converged
+MAX_TURN_RAD, MAX_MOVE_M, MAX_BETA = 1e3, 1e6, 1e2  # beyond these, the fit has not converged
 
 
 def check_smpl(path: Path, theta: np.ndarray, moves_m: np.ndarray, betas: np.ndarray) -> None:
-    """Raise InputError naming the file where SMPL parameters are not finite, or larger than any body's."""
+    """Raise InputError naming the file if SMPL parameters are not finite, or larger than any body's."""
     parts = (("turns", theta, MAX_TURN_RAD), ("translations", moves_m, MAX_MOVE_M), ("shape values", betas, MAX_BETA))
     for what, values, limit in parts:
         if not (np.abs(values) <= limit).all():  # also true for NaN
@@ -25,8 +25,8 @@ class GivenPoses:
     """SMPL parameters, a row for each of a capture's frames, NaN where a frame has none: a vertex in the world is root
     @ SMPL(theta, betas).
 
-    theta (n, 24, 3) axis-angle in SMPL's axes, the pelvis's turn first; root (n, 4, 4) metres, applied after the model
-    turned about its pelvis; betas (10,).
+    theta (n, 24, 3) axis-angle in SMPL's axes, the pelvis's rotation first; root (n, 4, 4) metres, applied after the
+    model's rotation about its pelvis; betas (10,).
     """
 
     theta: np.ndarray

@@ -55,8 +55,8 @@ DEFAULT_FPS = 30.0  # of images, whose files state none
 # Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
 SIZE_TOLERANCE = 0.02
 RATE_TOLERANCE = 0.01  # between frame rates, as a share
-MIN_KEPT_SHARE = 0.5  # of an undistorted picture: a lens takes less than a fifth of it
-MAX_MISPLACED_SHARE = 0.5  # of keypoints outside their images, where detectors guess some, or in the first pixel
+MIN_KEPT_SHARE = 0.5  # of an undistorted image: a lens loses less than a fifth of it
+MAX_MISPLACED_SHARE = 0.5  # of keypoints outside their images (detectors guess some there) or in the first pixel
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
     PeopleSnapshot,
@@ -65,12 +65,12 @@ LAYOUTS: tuple[type[Layout], ...] = (
     Caliscope,
     Pose2Sim,
     Videos,
-)  # the first that recognises a folder
-BLACK = 8  # grey level that noise and an encoder leave of black
+)  # the first that recognises a folder is used
+BLACK = 8  # grey level up to which noise and encoding can raise black
 MAX_NAMED = 5  # in a warning
 BY_CAMERA = ("images", "openpose", "masks", "mask", "background")  # folders of EasyMocap
 READ_SUFFIXES = VIDEO_SUFFIXES + IMAGE_SUFFIXES + JSON_SUFFIXES
-BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
+BAR_FRAMES = 5  # evenly spaced frames in which black bars are searched for
 
 log = logging.getLogger("hnerf.capture")
 
@@ -78,17 +78,17 @@ log = logging.getLogger("hnerf.capture")
 def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Uncalibrated | None = None) -> Capture:
     """Read a capture folder (in any of LAYOUTS), or one video, and write it normalised into `out`.
 
-    Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. Where `capture.toml`
-    names no frames, those before the first and after the last detected person are left out. A recording that is
-    `uncalibrated` is read without the poses of its cameras, all of which are then for training, and without footage of
-    a board. Raises InputError, one line that names the file, on anything missing, unreadable, contradictory or unsafe.
+    Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. If `capture.toml`
+    names no frames, those before the first and after the last detected person are left out. An `uncalibrated` recording
+    is read without camera poses and board footage; all its cameras are then for training. Raises InputError, one line
+    that names the file, on anything missing, unreadable, contradictory or unsafe.
     """
     layout = uncalibrated or recognise(folder)
     lenses = layout.lenses()
     if not uncalibrated:
         _warn_of_unread(folder, ("keypoints",), set(lenses))
     if isinstance(layout, EasyMocap):
-        places = BY_CAMERA if isinstance(layout, Videos) else (*BY_CAMERA, "videos")  # a lone video has any name
+        places = BY_CAMERA if isinstance(layout, Videos) else (*BY_CAMERA, "videos")  # a lone video can have any name
         _warn_of_unread(folder, places, set(lenses))
         _warn_of_unread(folder, ("pose",), {f"{name}_json" for name in lenses})
     manifest = _manifest_for(layout, folder)
@@ -140,8 +140,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
 
 
 def exported_lenses(folder: Path) -> list[Lens]:
-    """Return the cameras of a capture folder for other tools: in metres, and with the size of their first image where
-    the calibration states none, if there is one. Raises InputError as `ingest` does."""
+    """Return the cameras of a capture folder for other tools: in metres and, if the calibration states no size, with
+    that of their first image, if there is one. Raises InputError as `ingest` does."""
     layout, metres = recognise(folder), read_manifest(folder).metres_per_unit
     return [
         replace(lens, t_m=metres * lens.t_m, size_px=lens.size_px or _first_size(layout, name))
@@ -150,7 +150,7 @@ def exported_lenses(folder: Path) -> list[Lens]:
 
 
 def _first_size(layout: Layout, camera: str) -> tuple[int, int] | None:
-    """Return the (width, height) of a camera's first image; None where there is none."""
+    """Return the (width, height) of a camera's first image; None if there is none."""
     with suppress(InputError):
         footage = layout.footage(camera)
         height_px, width_px = next(footage.read(footage.frames[:1])).rgb.shape[:2]
@@ -184,11 +184,11 @@ def recognise(folder: Path) -> Layout:
 
 
 def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
-    """Read what `capture.toml` says of a recording in this layout.
+    """Read `capture.toml` for a recording in this layout, without the entries that cannot apply to it.
 
-    Without calibration there is neither a split of the cameras nor a subject named by the ground; and, of one camera by
-    itself, neither common frames nor a subject named in another. Raises InputError where the world's vertical axis is
-    not that of the layout's own world.
+    For an uncalibrated recording, the camera split and a subject named by a point on the ground are dropped; if only
+    one of its cameras is read, so are the frame split and a subject named in another camera. Raises InputError if `up`
+    is not the vertical axis of the layout's own world.
     """
     manifest = read_manifest(folder)
     if isinstance(layout, PeopleSnapshot | Videos) and manifest.up != "z":
@@ -202,7 +202,7 @@ def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
 
 
 def _warn_of_unread(folder: Path, places: tuple[str, ...], expected: set[str]) -> None:
-    """Warn of images, masks and others whose names, in these places, are those of none of the calibrated cameras."""
+    """Warn about images, masks and other files in these places that are not named after a calibrated camera."""
     for place in places:
         found = path_in_capture(folder, place)
         entries = [p for p in sorted(found.iterdir()) if not p.name.startswith(".")] if found.is_dir() else []
@@ -215,7 +215,7 @@ def _warn_of_unread(folder: Path, places: tuple[str, ...], expected: set[str]) -
 
 
 def _check_subject(folder: Path, manifest: CaptureManifest, recorded: dict[str, set[int]]) -> None:
-    """Raise InputError if the point that names the subject is in no training camera, or in no frame that was recorded,
+    """Raise InputError if the point that names the subject is in no training camera, or in no recorded frame. recorded:
     by camera."""
     point = manifest.subject_point
     if point is None or not point.camera:
@@ -234,8 +234,8 @@ def _check_subject(folder: Path, manifest: CaptureManifest, recorded: dict[str, 
 def _subject_point(
     manifest: CaptureManifest, normalisers: dict[str, Normaliser], frames: tuple[int, ...]
 ) -> SubjectPoint | None:
-    """Return the point that names the subject, in pixels of the normalised image of the chosen frame nearest to its
-    own (the first one where it names none). Raises InputError where the lens pictures no such point."""
+    """Return the point that names the subject, in pixels of the normalised image of the chosen frame nearest to its own
+    (the first one if it names none). Raises InputError if the point is outside the lens's valid image area."""
     point = manifest.subject_point
     if point is None or not point.camera:
         return point
@@ -247,7 +247,7 @@ def _subject_point(
 
 
 def _common_frames(footage: dict[str, Footage | InStep]) -> tuple[int, ...]:
-    """Return the frames of all cameras. Raises InputError where cameras differ in frames or frame rate."""
+    """Return the frames of all cameras. Raises InputError if cameras differ in frames or frame rate."""
     (first_name, first), *others = footage.items()
     for _, other in others:
         if other.frames != first.frames:
@@ -267,10 +267,10 @@ def _common_frames(footage: dict[str, Footage | InStep]) -> tuple[int, ...]:
 def _frame_rate(
     folder: Path, stated: float | None, filmed: dict[str, Footage], footage: dict[str, Footage | InStep]
 ) -> float:
-    """Return how many of the common frames a second has.
+    """Return the frame rate of the common frames.
 
-    A rate stated in `capture.toml` is that of images, and corrects one that all videos have (slow motion). Raises
-    InputError where it is not that of the slowest of several rates, whose frames are counted.
+    A rate stated in `capture.toml` applies to images, and overrides one that all videos share (slow motion). If rates
+    differ, the frames of the slowest camera count; raises InputError if the stated rate is not the slowest video's.
     """
     counted = min((one.fps for one in footage.values() if one.fps), default=stated or DEFAULT_FPS)
     most = (1 + RATE_TOLERANCE) * counted
@@ -288,8 +288,8 @@ def _write_cameras(
     layout: Layout, lenses: dict[str, Lens], footage: dict[str, Footage | InStep], frames: tuple[int, ...],
     settings: CaptureSettings, out: Path,
 ) -> tuple[dict[str, Normaliser], dict[str, Area]]:  # fmt: skip
-    """Write the images of every camera; return how they were normalised, and where black bars prove that the calibrated
-    picture lies."""
+    """Write the images of every camera; return their normalisers, and the areas that calibrated pictures fill where
+    black bars prove it."""
     normalisers: dict[str, Normaliser] = {}
     areas: dict[str, Area] = {}
     for name, recording in footage.items():
@@ -301,7 +301,7 @@ def _write_cameras(
 
 
 def _write_given_poses(folder: Path, layout: Layout, frames: tuple[int, ...], out: Path) -> None:
-    """Write the poses that come with these frames, if any do. Raises InputError if they lack all of these frames."""
+    """Write the given poses, if the recording has any. Raises InputError if none of these frames has one."""
     poses = layout.given_poses(frames)
     if poses and not poses.known.any():
         raise InputError(f"{folder}: none of the chosen frames has a given pose; choose others, or remove the poses")
@@ -337,7 +337,7 @@ def _write_pixels(
 
 
 def _write_masks(normaliser: Normaliser, masks: dict[int, Path | StoredFrame], out: Path, soft: bool = False) -> None:
-    """Write the masks of one camera, by frame; all of them again as soft where one has soft edges."""
+    """Write the masks of one camera, by frame. If one has soft edges, all of them are written again as soft."""
     for frame, mask in tracked(masks.items(), f"masks of camera {normaliser.lens.name}", len(masks)):
         recorded = mask.read() if isinstance(mask, StoredFrame) else read_mask(mask)
         path = mask.path if isinstance(mask, StoredFrame) else mask
@@ -347,7 +347,7 @@ def _write_masks(normaliser: Normaliser, masks: dict[int, Path | StoredFrame], o
 
 
 def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> None:
-    """Raise InputError if undistortion would leave nothing of most of a picture of (width, height) pixels."""
+    """Raise InputError if most of the undistorted image of (width, height) pixels was never recorded."""
     if np.any(lens.distortion) and (kept := kept_share(lens, size_px)) < MIN_KEPT_SHARE:
         raise InputError(
             f"{footage}: by the distortion of camera {lens.name}, {1 - kept:.0%} of the picture was never recorded; "
@@ -367,7 +367,7 @@ def _mask_paths(
 
 
 def _lens_as_recorded(lens: Lens, footage: Footage | InStep, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
-    """Return the lens for the recorded size, and where the calibrated picture lies in it if black bars prove that.
+    """Return the lens for the recorded size, and the area that the calibrated picture fills if black bars prove it.
 
     Without such a proof the lens is unchanged. Raises InputError if the sizes then differ too much.
     """
@@ -415,10 +415,10 @@ def _people_in_step(layout: Layout, footage: dict[str, Footage | InStep]) -> dic
 
 
 def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
-    """Return detected keypoints (frames, most people, K, 3), absent people zero; None where there are none.
+    """Return detected keypoints (frames, most people, K, 3), zero for absent people; None if there are none.
 
-    They come from the layout's own files, else from a list of results in keypoints/<camera>.json. Raises InputError
-    where they are not in the pixels of the images.
+    They come from the layout's own files, else from a list of results in keypoints/<camera>.json. Raises InputError if
+    they are not in pixels of the images.
     """
     recorded = footage.frames
     files = layout.keypoint_files(camera)
@@ -445,8 +445,8 @@ def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | No
 
 
 def _check_in_pixels(place: Path, points: np.ndarray, picture: VideoFrame) -> None:
-    """Raise InputError if most keypoints (n, 2) of a camera cannot be in the pixels of its images: they are outside, or
-    in the first pixel, as shares of the picture would be."""
+    """Raise InputError if most of a camera's keypoints (n, 2) cannot be in pixels of its images: they are outside, or
+    in the first pixel, as coordinates from 0 to 1 would be."""
     size_px = np.array(picture.rgb.shape[1::-1])
     if not len(points):
         return
@@ -460,8 +460,9 @@ def _check_in_pixels(place: Path, points: np.ndarray, picture: VideoFrame) -> No
 
 
 def _frames_with_people(people: list[np.ndarray], frames: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the frames from the first to the last in which any camera, (frames, people, K, 3), saw anybody: others
-    have no pose to find. All frames where nobody was ever seen, which the calibration stage reports."""
+    """Return the frames from the first to the last in which any camera saw anybody: others have no pose to find.
+    people: per camera (frames, people, K, 3). Return all frames if nobody was ever seen, which the calibration stage
+    reports."""
     seen = np.flatnonzero(np.any([(found[..., 2] > 0).any((1, 2)) for found in people], axis=0))
     if not people or not len(seen):
         return frames

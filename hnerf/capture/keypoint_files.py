@@ -1,4 +1,4 @@
-"""Files that keypoint detectors write: OpenPose's, one a frame; and lists of COCO results, one a camera."""
+"""Files that keypoint detectors write: OpenPose's, one per frame, and lists of COCO results, one per camera."""
 
 import json
 import re
@@ -17,8 +17,8 @@ MAX_PX = 1e6  # of a coordinate; far larger ones overflow in later arithmetic
 
 
 def read_openpose(path: Path) -> np.ndarray:
-    """Read an OpenPose file: (people, K, 3) x_px, y_px, confidence in the file's order, K a known number of points, or
-    0 without people, among whom nobody counts who has no points. Raises InputError if it is no such file."""
+    """Read an OpenPose file: (people, K, 3) x_px, y_px, confidence in the file's order. K is a known number of points,
+    or 0 without people; people without points are ignored. Raises InputError if it is no such file."""
     try:
         people = _check_count(path, read_json(path)["people"])
         found = [person["pose_keypoints_2d"] for person in people if person != {}]
@@ -39,7 +39,7 @@ def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
     people for each of the frames as `read_openpose` does.
 
     image_id: the frame's number, or an image name that ends in it. Frames that are not listed show nobody. Raises
-    InputError if it is no such file, or is of other frames.
+    InputError if it is no such file, or lists other frames.
     """
     frames = tuple(frames)
     try:
@@ -62,8 +62,8 @@ def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
 
 
 def _frame(image_id: object) -> int:
-    """Return the frame number that an image_id is, or that ends it: 12, "12.jpg" and "walk_000012.png" are frame 12.
-    Raises ValueError if there is none."""
+    """Return the frame number that an image_id is or ends in: 12, "12.jpg" and "walk_000012.png" are frame 12. Raises
+    ValueError if there is none."""
     if type(image_id) is int and image_id >= 0:
         return image_id
     found = re.search(r"([0-9]{1,9})(\.\w+)?$", image_id) if isinstance(image_id, str) else None
@@ -96,7 +96,7 @@ def _people(path: Path, triples: list[Any]) -> np.ndarray:
 
 
 def without_far_points(path: Path, points: np.ndarray) -> np.ndarray:
-    """Return keypoints (..., 3), those beyond MAX_PX zero. Raises InputError if one of them was seen."""
+    """Return keypoints (..., 3) with those beyond MAX_PX set to zero. Raises InputError if one of them was seen."""
     far = (np.abs(points[..., :2]) > MAX_PX).any(-1)
     if (points[far][:, 2] > 0).any():
         raise InputError(f"{path}: a keypoint is beyond {MAX_PX:g} px; detect them again")

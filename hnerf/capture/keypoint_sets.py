@@ -1,8 +1,8 @@
 """The keypoint sets that detectors write, and their conversion to OpenPose's BODY_25, the only one used after
 ingestion.
 
-BODY_25's neck is the midpoint of the shoulders and its mid-hip that of the hips; both are computed so for any set that
-lacks them. The neck that a set has itself (BODY_25B, Halpe) is the base of the skull and is left out.
+BODY_25's neck is the midpoint of the shoulders and its mid-hip that of the hips; both are computed this way for any set
+that lacks them. The neck of BODY_25B and Halpe is the base of the skull and is not used.
 """
 
 from typing import Literal, NamedTuple
@@ -21,16 +21,16 @@ KeypointSetName = Literal[
 
 
 class KeypointSet(NamedTuple):
-    """One keypoint set. points: how many a person has; rows (25): the points whose mean is each BODY_25 keypoint, none
-    where the set lacks it."""
+    """One keypoint set. points: number per person; rows (25): for each BODY_25 keypoint, the points whose mean it is;
+    none if the set lacks it."""
 
     points: int
     rows: tuple[tuple[int, ...], ...]
 
 
 # All sets but OpenPose's older two begin with COCO's 17 (Lin et al. 2014: nose, then left and right eye, ear, shoulder,
-# elbow, wrist, hip, knee, ankle). Here are BODY_25's nose to left ear from those; the feet follow: left big toe, small
-# toe, heel, then the right.
+# elbow, wrist, hip, knee, ankle). This gives BODY_25's nose to left ear in terms of those; the feet follow: left big
+# toe, small toe, heel, then the right.
 _COCO = (
     (0,), (5, 6), (6,), (8,), (10,), (5,), (7,), (9,), (11, 12), (12,), (14,), (16,), (11,), (13,), (15,),
     (2,), (1,), (4,), (3,),
@@ -63,9 +63,9 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
     """Convert detections (frames, people, K, 3) x_px, y_px, confidence by camera to BODY_25 keypoints (frames, people,
     25, 3).
 
-    `named` is the set of all cameras; without it the set is known from the number of points, and for 25, which two sets
-    have, from which points are the face. K is 0 where nobody was detected. Raises InputError where `named` has another
-    number of points.
+    `named` is the set of all cameras. Without it, the number of points identifies the set; for 25, which two sets have,
+    so does which points form the face. K is 0 if nobody was detected. Raises InputError if `named` has another number
+    of points.
     """
     of_25 = [points.reshape(-1, 25, 3) for points in detections.values() if points.shape[-2] == 25]
     of_face = not of_25 or is_body_25(np.concatenate(of_25))
@@ -87,7 +87,7 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
 
 
 def _combined(points: np.ndarray, known: KeypointSet) -> np.ndarray:
-    """Return BODY_25 keypoints (..., 25, 3) of points (..., K, 3). A mean of two points has the lower confidence, and
+    """Return BODY_25 keypoints (..., 25, 3) from points (..., K, 3). A mean of two points has the lower confidence, and
     is absent if either is."""
     combined = np.zeros((*points.shape[:-2], 25, 3))
     for k, rows in enumerate(known.rows):
@@ -98,12 +98,11 @@ def _combined(points: np.ndarray, known: KeypointSet) -> np.ndarray:
 
 
 def is_body_25(keypoints: np.ndarray) -> bool:
-    """Return whether (..., 25, 3) detections are in BODY_25's order rather than BODY_25B's; True where they do not show
-    it.
+    """Return whether (..., 25, 3) detections are in BODY_25's order rather than BODY_25B's; True if they do not tell.
 
     BODY_25's points 1 to 4 are neck and right arm, and 15 to 18 are eyes and ears; BODY_25B's points 1 to 4 are eyes
-    and ears, and among 15 to 18 are the ankles. A face is smaller than these from every side, and its points lie close
-    together whatever a detector's error. Most detections decide.
+    and ears, and among 15 to 18 are the ankles. From every side, a face is smaller than the extent of the other points,
+    whatever a detector's error. The majority of detections decides.
     """
     people = keypoints.reshape(-1, 25, 3)
     first_px, last_px = _extent_px(people[:, 1:5]), _extent_px(people[:, 15:19])
@@ -111,7 +110,8 @@ def is_body_25(keypoints: np.ndarray) -> bool:
 
 
 def _extent_px(points: np.ndarray) -> np.ndarray:
-    """Return the diagonal of the box around the points that are seen of (n, K, 3); NaN where fewer than two are."""
+    """Return the diagonal of the box around the visible points of each of (n, K, 3); NaN if fewer than two are
+    visible."""
     seen = points[..., 2:] > 0
     low, high = (np.where(seen, points[..., :2], far) for far in (np.inf, -np.inf))
     extent_px = np.linalg.norm(high.max(1) - low.min(1), axis=-1)

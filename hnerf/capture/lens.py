@@ -13,10 +13,10 @@ from hnerf.geometry.camera import Camera
 
 MIN_FOCAL_PX = 1.0  # a smaller focal length is an error of units
 MAX_SKEW_PX = 0.1  # of a camera with distortion, which OpenCV undistorts as if there were no skew
-MAX_NUMBER = 1e9  # of a calibration; beyond it, later arithmetic overflows
+MAX_NUMBER = 1e9  # largest number in a calibration; beyond it, later arithmetic overflows
 # OpenCV's default of 5 iterations is off by pixels.
 UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)
-MAX_OFF_PX = 1.0  # between a recorded pixel and the picture of the ray that was found for it
+MAX_OFF_PX = 1.0  # between a recorded pixel and the projection of the ray that was found for it
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Lens:
     """A calibrated camera with lens distortion: K (3, 3) pixels; distortion (4,) or (5,), OpenCV's k1 k2 p1 p2 [k3]; R
     (3, 3), t_m (3,) world to camera.
 
-    `size_px` is the (width, height) that was calibrated, None where the file does not say; `estimated`: whether
+    `size_px` is the (width, height) that was calibrated, None if the file does not say; `estimated`: whether
     K comes from an angle or from the person, not from a file of intrinsics.
     """
 
@@ -43,8 +43,8 @@ def pinhole(camera: Camera) -> Lens:
 
 
 def undistort_points(points_px: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Map pixels (..., 2) of a recorded image to those of the pinhole camera with the same K; NaN stays, and stands
-    outside the lens's valid image area, for which OpenCV returns any pixel."""
+    """Map pixels (..., 2) of a recorded image to those of the pinhole camera with the same K; NaN stays NaN. Pixels
+    outside the lens's valid image area, for which OpenCV returns arbitrary pixels, become NaN."""
     if points_px.size == 0:  # for which OpenCV returns None
         return points_px
     flat = np.ascontiguousarray(points_px.reshape(-1, 1, 2))
@@ -69,14 +69,14 @@ def undistort_keypoints(keypoints: np.ndarray, K: np.ndarray, distortion: np.nda
 
 
 def known_size(lens: Lens) -> tuple[int, int]:
-    """Return the (width, height) that a file to be written must state. Raises InputError where it is not known."""
+    """Return the (width, height) that a file to be written must state. Raises InputError if it is not known."""
     if lens.size_px is None:
         raise InputError(f"intri.yml: camera {lens.name} has no size; add W_{lens.name} and H_{lens.name}")
     return lens.size_px
 
 
 def by_name(lenses: Iterable[Lens], source: Path) -> dict[str, Lens]:
-    """Return lenses by their names. Raises InputError naming `source` where two have the same."""
+    """Return lenses by name. Raises InputError naming `source` if two have the same name."""
     found: dict[str, Lens] = {}
     for lens in lenses:
         if lens.name in found:
@@ -95,7 +95,8 @@ def checked_lens(
     size_px: tuple[float, float] | None,
     estimated: bool = False,
 ) -> Lens:
-    """Return a Lens from numbers of any shape. Raises InputError naming file and camera if they are not a camera.
+    """Return a Lens from numbers of any shape. Raises InputError naming file and camera if they do not describe a
+    camera.
 
     sources: the files of the intrinsics and of the extrinsics. R: a matrix or a rotation vector (Rodrigues).
     """

@@ -1,4 +1,4 @@
-"""`capture.toml`: what a layout does not state itself, and the splits of cameras and frames."""
+"""`capture.toml`: settings that a layout does not state itself, and the splits of cameras and frames."""
 
 import difflib
 import logging
@@ -20,12 +20,12 @@ from hnerf.errors import InputError
 
 log = logging.getLogger("hnerf.capture")
 
-MIN_KEY_SIMILARITY = 0.8  # of an unknown key to a known one (difflib) that makes it a typing error
+MIN_KEY_SIMILARITY = 0.8  # of an unknown key to a known one (difflib), from which it counts as a typo
 MAX_BYTES = 65_536
 NAMED_BY, NUMBER = "nearest", r"\s*(-?\d{1,9}(?:\.\d*)?)\s*"
 SUBJECT = re.compile(rf"nearest to \({NUMBER},{NUMBER}\)(?: in (.+?)(?: at frame (\d{{1,9}}))?)?")
-NO_FRAME = -1  # of a subject's point
-MAX_NAME_BYTES = 200  # file systems allow 255, also for longer names made from it
+NO_FRAME = -1  # of a subject's point without a frame
+MAX_NAME_BYTES = 200  # file systems allow 255, which must also hold longer names made from it
 
 FrameNumber = Annotated[int, Field(ge=0, le=999_999_999)]
 
@@ -79,8 +79,8 @@ class CaptureManifest(_Table):
 
     @property
     def subject_point(self) -> SubjectPoint | None:
-        """Return the point by which the subject is named, in recorded pixels or in metres; None where there is none.
-        The frame is NO_FRAME where none is given."""
+        """Return the point by which the subject is named, in recorded pixels or in metres; None if there is none. The
+        frame is NO_FRAME if none is given."""
         named = SUBJECT.fullmatch(self.subject) if isinstance(self.subject, str) else None
         if not named:
             return None
@@ -97,7 +97,7 @@ class CaptureManifest(_Table):
 
     @property
     def metres_per_unit(self) -> float:
-        """Return how many metres the calibration's unit of length has."""
+        """Return the calibration's unit of length in metres."""
         return {"m": 1.0, "mm": 1e-3}[self.units] if isinstance(self.units, str) else self.units
 
 
@@ -117,8 +117,8 @@ def read_manifest(folder: Path) -> CaptureManifest:
 
 
 def capture_name(folder: Path, manifest: CaptureManifest) -> str:
-    """Return the name of the subject: that of `capture.toml`, else of the folder or the video, without signs that a
-    folder of results cannot have. Raises InputError if there is nothing left to call it by, or too much."""
+    """Return the name of the subject: from `capture.toml`, else from the folder or the video, with characters replaced
+    that the name of a results folder cannot have. Raises InputError if the name is invalid or too long."""
     place = folder.resolve()
     source, given = folder / "capture.toml", manifest.name
     if given is None:
@@ -146,11 +146,11 @@ def chosen_cameras(folder: Path, manifest: CaptureManifest, calibrated: list[str
 def chosen_frames(
     folder: Path, manifest: CaptureManifest, recorded: tuple[int, ...], novel_pose_share: float, max_frames: int
 ) -> FrameSplit:
-    """Return the frames that `capture.toml` names, else the first of the recorded ones for training and a last share
-    for novel poses, evenly strided so that at most `max_frames` are for training.
+    """Return the frames that `capture.toml` names, else the recorded ones: the last share for novel poses, the others
+    for training, evenly strided so that at most `max_frames` are for training.
 
-    Neighbouring frames of a long recording are nearly the same picture, while each costs time to fit and train on.
-    Raises InputError on a frame that is not recorded or is named twice.
+    Neighbouring frames of a long recording are nearly identical, but each costs time to fit and train on. Raises
+    InputError on a frame that is not recorded or is named twice.
     """
     if manifest.frames is None:
         novel = recorded[len(recorded) - int(novel_pose_share * len(recorded)) :]

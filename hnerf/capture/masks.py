@@ -13,8 +13,8 @@ from hnerf.errors import InputError
 
 @dataclass(frozen=True)
 class Masks:
-    """Masks of a capture. encoded: by (camera, frame), PNG bytes of 0/255, without the masks that were dropped; report:
-    plain values."""
+    """Masks of a capture. encoded: PNG bytes of 0/255 by (camera, frame), without dropped masks; report: plain
+    values."""
 
     encoded: dict[tuple[str, int], bytes]
     report: dict[str, Any]

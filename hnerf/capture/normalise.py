@@ -12,9 +12,9 @@ from hnerf.capture.lens import Lens, distort_points, undistort_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MAX_ROUNDING = 1.0  # grey levels, by which two decoders differ on average
-MAX_LABELS = 64  # levels of a mask of labels; a mask of more has soft edges
-GRID = 32  # samples along each side of a picture, to see what a distortion does
+MAX_ROUNDING = 1.0  # average difference between two decoders, in grey levels
+MAX_LABELS = 64  # levels in a mask of labels; a mask with more has soft edges
+GRID = 32  # samples along each side of an image, to measure what a distortion does
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Normaliser:
     def write_image(self, rgb: np.ndarray, source: Path, verbatim: Path | None, target: Path) -> None:
         """Write an image to `target` plus a suffix.
 
-        The file itself is copied where `read_rgb` finds these pixels in it, too, whatever it makes of the EXIF.
+        The file `verbatim` itself is copied if `read_rgb` reads the same pixels from it, however it handles EXIF.
         Otherwise a JPEG of quality 95 without chroma subsampling is written: its error is far below that of the
         resampling, at a fifth of a PNG's size.
         """
@@ -78,7 +78,7 @@ class Normaliser:
     def write_mask(self, recorded: np.ndarray, soft: bool, source: Path, target: Path) -> None:
         """Write a mask (H, W) uint8 from file `source` as 0/255 PNG.
 
-        The person is any level but black; where the camera's masks have soft edges, any light level.
+        The person is any level but black; if the camera's masks have soft edges, any light level.
         """
         self._check_size(recorded, source)
         black = 127 if soft else 0
@@ -101,8 +101,8 @@ def has_soft_edges(mask: np.ndarray, source: Path) -> bool:
 
 
 def kept_share(lens: Lens, size_px: tuple[int, int]) -> float:
-    """Return the share of an undistorted picture of (width, height) pixels that the recorded one shows, by GRID x GRID
-    samples."""
+    """Return the share of an undistorted image of (width, height) pixels that the recorded image covers, from GRID x
+    GRID samples."""
     corner = np.array(size_px) - 1.0
     at_px = np.stack(np.meshgrid(*np.linspace(0, corner, GRID).T), -1).reshape(-1, 2)
     recorded_px = distort_points(at_px, lens.K, lens.distortion)
@@ -110,6 +110,6 @@ def kept_share(lens: Lens, size_px: tuple[int, int]) -> float:
 
 
 def _reads_as(path: Path, rgb: np.ndarray) -> bool:
-    """Return whether `read_rgb` finds the same picture in a file, but for the rounding of another decoder."""
+    """Return whether `read_rgb` reads the same image from a file, up to the rounding of another decoder."""
     read = read_rgb(path)
     return read.shape == rgb.shape and cv2.norm(read, rgb, cv2.NORM_L1) < MAX_ROUNDING * rgb.size

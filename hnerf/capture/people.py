@@ -1,4 +1,4 @@
-"""People followed through a recording: detections on which the cameras agree, from frame to frame."""
+"""Tracking of people through a recording: detections on which the cameras agree, from frame to frame."""
 
 from itertools import combinations, pairwise
 from typing import NamedTuple
@@ -10,22 +10,22 @@ from hnerf.geometry.triangulation import confidence_of, solve_points
 
 AGREEMENT_REACH = 0.15  # of a person's height in the image: beyond it a keypoint does not support a hypothesis
 UNSUPPORTED_WEIGHT = 0.1  # of a detection without support from other cameras: one may be badly calibrated
-MIN_SUPPORT = 0.2  # agreement of the others with a detection, 0.8 for a good one, that is no chance of a few keypoints
-USUALLY = 0.5  # share of a camera's images in which the others support it, from which the rest of them are mistakes
+MIN_SUPPORT = 0.2  # agreement of others with a detection (0.8 for a good one) that is no chance hit of a few keypoints
+USUALLY = 0.5  # if others support at least this share of a camera's images, its unsupported detections are mistakes
 CANDIDATES = 8  # combinations of people kept in each frame
 JUMP_COST = 4.0  # in best scores of one camera, for moving by the person's own height between frames
 FREE_JUMPS = 2.0  # in median movements between frames: jumps up to this cost nothing
-MAX_PAIRED = 12  # people of an image, the most prominent, who are compared with those of other cameras
-MAX_PEOPLE = 4  # followed: the subject, and those whom the report says were left
-SAME_SHARE = 0.1  # of a person's height: mean distance of the keypoints of one person, found twice
+MAX_PAIRED = 12  # most prominent people of an image who are compared with those of other cameras
+MAX_PEOPLE = 4  # followed: the subject, and those whom the report lists as left out
+SAME_SHARE = 0.1  # of a person's height: mean keypoint distance up to which two detections are one person
 MOST_MOVING = 90  # percentile of keypoints
-STILL_SHARE = 0.05  # of a height, that a picture of a person does not move by (noise of a detector: a hundredth)
+STILL_SHARE = 0.05  # of a person's height: a picture of a person moves less (detector noise: a hundredth)
 
 
 class PersonTrack(NamedTuple):
     """A person followed through a recording. keypoints (C, frames, 25, 3), 0 where not seen; claim, in [0, 1]: the mean
     over cameras and frames of size x confidence x centrality x agreement of the cameras; moves: whether any part of the
-    person does, as those of a picture on a wall do not."""
+    person does, unlike a picture on a wall."""
 
     keypoints: np.ndarray
     claim: float
@@ -33,8 +33,8 @@ class PersonTrack(NamedTuple):
 
 
 def follow_in_each_camera(cameras: list[Camera], people: list[np.ndarray]) -> list[PersonTrack]:
-    """Return, as one person, whom each camera for itself shows most prominently; `follow_people` where it is not known
-    how cameras stand to each other. An empty list if nobody is seen."""
+    """Follow the most prominent person in each camera separately and return them as one person; replaces
+    `follow_people` if the cameras' relative poses are unknown. Returns an empty list if nobody is seen."""
     alone = [follow_people([camera], [found]) for camera, found in zip(cameras, people, strict=True)]
     best = [max(tracks, key=lambda track: (track.moves, track.claim), default=None) for tracks in alone]
     if not any(best):
@@ -48,7 +48,7 @@ def follow_in_each_camera(cameras: list[Camera], people: list[np.ndarray]) -> li
 
 
 def follow_people(cameras: list[Camera], people: list[np.ndarray]) -> list[PersonTrack]:
-    """Follow the most prominent person through time, then those who are left, at most MAX_PEOPLE.
+    """Follow the most prominent person through time, then the remaining ones, at most MAX_PEOPLE.
 
     people: per camera (frames, P, 25, 3), in any order. A person is followed (Viterbi) over combinations of one
     detection from each camera on which the cameras agree: two-view triangulation predicts where each camera must see
@@ -95,7 +95,7 @@ def moves(keypoints: np.ndarray) -> bool:
 
 
 def _same_place(person: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return whether detections (..., 25, 3) are of one person: the person's own, or the same found twice."""
+    """Return whether detections (..., 25, 3) show one person: the same detection, or the person detected twice."""
     both = np.minimum(person[..., 2], others[..., 2])
     distance = (np.linalg.norm(person[..., :2] - others[..., :2], axis=-1) * both).sum(-1) / both.sum(-1).clip(1e-9)
     height = np.maximum(person_heights_px(person), 1)
@@ -153,8 +153,8 @@ def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndar
 
 
 def _support(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> np.ndarray:
-    """Return the confidence-weighted share of the keypoints of people (P, 25, 3) onto which points (n, 25, 3) project,
-    (n, P)."""
+    """Return the confidence-weighted share of each person's keypoints, people (P, 25, 3), onto which points (n, 25, 3)
+    project: (n, P)."""
     uv, depth_m = camera.project(points_m)
     height_px = person_heights_px(people).clip(1)
     distance = np.linalg.norm(uv[:, None] - people[None, ..., :2], axis=-1) / height_px[:, None]
@@ -184,9 +184,9 @@ def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
 def _most_probable_sequence(
     candidates: list[_Candidates], people: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the most probable sequence of combinations, (frames, C), which of it other cameras support, and its mean
-    score: Viterbi with a cost for jumps in the image beyond what is typical of the recording. A person who is not seen
-    stays where he was last seen."""
+    """Return the most probable sequence of combinations, (frames, C), which of its detections other cameras support,
+    and its mean score: Viterbi with a cost for jumps in the image beyond what is typical of the recording. A person who
+    is not seen stays where last seen."""
     shown = [_picked_keypoints([p[i] for p in people], found.picks) for i, found in enumerate(candidates)]
     best = [[one[:1] for one in frame] for frame in shown]
     free_jump = FREE_JUMPS * float(np.median([_jump(a, b)[0, 0] for a, b in pairwise(best)])) if len(best) > 1 else 0.0

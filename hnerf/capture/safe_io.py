@@ -22,7 +22,7 @@ MAX_IMAGE_PIXELS = 36_000_000  # a frame of 8K video has 33 million
 MAX_SIDE_PX = 32_766  # of images that OpenCV can undistort
 MAX_TEXT_BYTES = 16_000_000
 MAX_TOML_BYTES = 500_000
-MAX_KEY_PARTS = 16  # of a dotted key in TOML; tomllib needs memory and time by their square
+MAX_KEY_PARTS = 16  # of a dotted key in TOML; tomllib's memory and time grow with their square
 # Exceptions on reading arrays from a file that is not a complete .npz of plain arrays; RuntimeError: an encrypted one,
 # or an unknown compression; OverflowError: a shape beyond all integers; tokenize.TokenError: a header with an open
 # bracket.
@@ -43,7 +43,7 @@ _CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # is used as a folder 
 _FRAME_NAME = re.compile(r"0*([0-9]{1,9})|(?:.*_)?0*([0-9]{1,9})_keypoints")
 _KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"{_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART}){{{MAX_KEY_PARTS}}}")
-_ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which is given keypoints with camera names as keywords
+_ARGUMENTS = ("file", "allow_pickle")  # of np.savez, to which keypoints are passed with camera names as keywords
 
 
 def check_camera_name(name: object, source: Path) -> str:
@@ -60,18 +60,18 @@ def check_camera_name(name: object, source: Path) -> str:
 
 
 def _composed(text: str) -> str:
-    """Return a text with one character for a letter and its accent, of which macOS makes two in file names."""
+    """Return a text with each accented letter as one character; macOS uses two in file names."""
     return unicodedata.normalize("NFC", text)
 
 
 def shown(value: object) -> str:
-    """Return how a message quotes what a stranger's file says: text, cut short, and nothing of anything else."""
+    """Return an untrusted file's value as a message quotes it: text is truncated, anything else is not shown."""
     return f"{value[:80]!r}{'...' if len(value) > 80 else ''}" if isinstance(value, str) else "that is no text"
 
 
 def path_in_capture(root: Path, *parts: str) -> Path:
-    """Return root/parts, which need not exist, its accents as the folder has them. Raises InputError if it leaves the
-    capture folder, passes through a link, or is a pipe or a device, which could be waited for without end."""
+    """Return root/parts, which need not exist, with accents as the folder spells them. Raises InputError if it leaves
+    the capture folder, passes through a link, or is a pipe or a device, which could block forever."""
     path = root
     for part in parts:
         path = path / _spelled(path, part)
@@ -99,8 +99,8 @@ def _spelled(folder: Path, name: str) -> str:
 
 def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Path]:
     """Return the files of a folder inside the capture, sorted by name; an empty list if there is no such folder.
-    suffixes: those to keep, in lower case, in whichever case files have them; none keeps all. Raises InputError where a
-    file takes the folder's place."""
+    suffixes: those to keep, in lower case, whatever their case in file names; none keeps all. Raises InputError if a
+    file is in the folder's place."""
     folder = path_in_capture(root, *parts)
     for place in (root.joinpath(*parts[:depth]) for depth in range(1, len(parts) + 1)):
         if place.is_file():
@@ -117,7 +117,7 @@ def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Pa
 
 def file_named(root: Path, stem: str, *parts: str, suffixes: tuple[str, ...]) -> Path:
     """Return the file called `stem` with one of these suffixes, matched as in `files_in`, in a folder inside the
-    capture; where there is none, the path that it would have with the first suffix. Raises InputError if there are
+    capture; if there is none, the path that it would have with the first suffix. Raises InputError if there are
     several."""
     found = by_camera([path for path in files_in(root, *parts, suffixes=suffixes) if _composed(path.stem) == stem])
     return found.get(stem) or path_in_capture(root, *parts, stem + suffixes[0])
@@ -136,8 +136,8 @@ def by_camera(paths: list[Path]) -> dict[str, Path]:
 
 
 def numbered(paths: list[Path], what: str) -> dict[int, Path]:
-    """Return files by the frame number that is their name, or, as OpenPose names its files, that comes before
-    `_keypoints`. Raises InputError on another name, or if two files have the same number."""
+    """Return files by frame number, which is their name or, as in OpenPose's file names, the part before `_keypoints`.
+    Raises InputError on another name, or if two files have the same number."""
     by_frame: dict[int, Path] = {}
     for path in paths:
         found = _FRAME_NAME.fullmatch(path.stem)
@@ -167,7 +167,7 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
 
 
 def _without_waiting(name: str, flags: int) -> int:
-    """Open a file; a pipe without a writer is opened at once."""
+    """Open a file without blocking, even a pipe without a writer."""
     return os.open(name, flags | os.O_NONBLOCK)
 
 
@@ -203,8 +203,8 @@ def read_toml(path: Path, max_bytes: int = MAX_TOML_BYTES) -> dict[str, Any]:
 
 
 def read_arrays(path: Path, wanted: Container[str], max_bytes: int) -> dict[str, np.ndarray]:
-    """Read those arrays of an .npz file that are wanted and there. Raises one of ARRAY_FILE_ERRORS if it is not an .npz
-    of plain arrays, InputError if they are larger than `max_bytes`, which a few kilobytes can be unpacked to."""
+    """Read those of the wanted arrays that an .npz file has. Raises one of ARRAY_FILE_ERRORS if it is not an .npz of
+    plain arrays, InputError if they unpack to more than `max_bytes`, as even a few kilobytes can."""
     with open(path, "rb", opener=_without_waiting) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise InputError(f"{path}: is no regular file; give the file itself")
@@ -233,14 +233,14 @@ def check_image_size(path: Path, width_px: float, height_px: float) -> tuple[int
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read an image, upright by its EXIF, as (H, W, 3) uint8 RGB. Raises InputError if it is not a whole 8-bit JPEG or
-    PNG of a sane size."""
+    """Read an image, turned upright by its EXIF orientation, as (H, W, 3) uint8 RGB. Raises InputError if it is not a
+    whole 8-bit JPEG or PNG of a sane size."""
     return _read_image(path, _colours)
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a mask, (H, W) uint8: the opacity of a person who is cut out of the background, else the lightest of the
-    colours. Raises InputError as `read_image` does."""
+    """Read a mask, (H, W) uint8: the opacity of a cut-out person, else the maximum of the colour channels. Raises
+    InputError as `read_image` does."""
     mask = _read_image(path, lambda image: _opacity(image) or _colours(image))
     return mask if mask.ndim == 2 else mask.max(-1)
 
@@ -250,7 +250,7 @@ def _colours(image: Image.Image) -> Image.Image:
 
 
 def _opacity(image: Image.Image) -> Image.Image | None:
-    """Return the opacity of an image; None where it is opaque everywhere."""
+    """Return the opacity of an image; None if it is opaque everywhere."""
     if image.mode not in ("LA", "RGBA") and "transparency" not in image.info:
         return None
     opacity = image.convert("RGBA").getchannel("A")
@@ -258,7 +258,8 @@ def _opacity(image: Image.Image) -> Image.Image | None:
 
 
 def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.ndarray:
-    """Read what is `wanted` of an image, upright by its EXIF. Raises InputError as `read_image` does."""
+    """Read an image, converted by `wanted` and turned upright by its EXIF orientation. Raises InputError as
+    `read_image` does."""
     image: Image.Image  # one at a time: each conversion is another copy
     try:
         with Image.open(path, formats=["JPEG", "PNG"]) as image:

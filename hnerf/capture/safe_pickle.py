@@ -38,7 +38,7 @@ def read_pickled_npy(path: Path) -> Any:
         version = np.lib.format.read_magic(stream)
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read_header(stream)
-    except Exception:  # the header is parsed as Python's literals, which raise nearly anything, too
+    except Exception:  # the header is parsed as a Python literal, which can raise nearly anything, too
         raise InputError(f"{path}: is no .npy file; export it again") from None
     if shape != () or dtype.kind != "O":
         raise InputError(f"{path}: holds no dictionary; export it again")
@@ -61,8 +61,8 @@ def _plain_data(path: Path, stream: io.BytesIO) -> Any:
 
 
 def _size(value: Any, known: dict[int, int]) -> int:
-    """Return how many items plain data has, where each list counts as often as it occurs: a list that holds one list
-    twice, thirty levels deep, is a billion of them to whatever makes an array of it. known: sizes by identity."""
+    """Return how many items plain data has, counting each list as often as it occurs: a list that holds one list twice,
+    thirty levels deep, becomes a billion items when it is made an array. known: sizes by identity."""
     if isinstance(value, np.ndarray) and value.dtype.kind == "O":
         parts: Iterable[Any] = value.flat
     elif isinstance(value, dict | list | tuple):
@@ -70,7 +70,7 @@ def _size(value: Any, known: dict[int, int]) -> int:
     else:
         return 1
     if id(value) not in known:
-        known[id(value)] = 1  # in data that contains itself
+        known[id(value)] = 1  # for data that contains itself
         known[id(value)] = 1 + sum(_size(part, known) for part in parts)
     return known[id(value)]
 
@@ -87,7 +87,7 @@ class _StandIn:
         self.state = state
 
     def plain(self, done: dict[int, Any]) -> Any:
-        """Return the plain data that the object stands for; `done` as in `_plain`."""
+        """Return the plain data that the object represents; `done` as in `_plain`."""
         raise pickle.UnpicklingError(f"{type(self).__name__} is no data")
 
 
@@ -144,8 +144,8 @@ class _Chumpy(_StandIn):
 
 
 def _from_bytes(data: Any, dtype: np.dtype[Any]) -> np.ndarray:
-    """Return an array of the items that bytes, or text of Python 2, hold. numpy trusts characters: Python fails later
-    on those that Unicode does not have."""
+    """Return an array of the items that bytes, or text of Python 2, hold. numpy accepts any character code, but Python
+    later fails on those that Unicode does not have."""
     flat = np.frombuffer(data.encode("latin1") if isinstance(data, str) else data, dtype)
     if (
         dtype.kind == "U"
@@ -165,17 +165,18 @@ def _reconstructed(kind: Any, *_: Any) -> _StandIn:
 
 
 def _encoded(text: str, encoding: str) -> bytes:
-    """Encode text as _codecs.encode does, by which Python 3 writes bytes for Python 2."""
+    """Encode text as _codecs.encode does, which Python 3 uses to write bytes for Python 2."""
     return text.encode("latin1")
 
 
 def _unhashed(items: Any) -> Any:
-    """Return the items of a set as they are: nobody looks into it, and tuples of shared parts hash without end."""
+    """Return the items of a set unhashed: no set is used, and tuples with shared parts can take forever to hash."""
     return items
 
 
 def _with_keys(code: bytes, keys: slice) -> Callable[[Any], None]:
-    """Return what loads the items of a dictionary, but no tuples for keys. keys: where they are on the stack."""
+    """Return an opcode's handler that loads dictionary items but refuses tuples as keys. keys: their slice of the
+    stack."""
 
     def load(unpickler: Any) -> None:
         if any(isinstance(key, tuple) for key in unpickler.stack[keys]):
@@ -186,7 +187,7 @@ def _with_keys(code: bytes, keys: slice) -> Callable[[Any], None]:
 
 
 def _refused(unpickler: Any) -> None:
-    """Refuse what allocates as much as a pickle says, or hashes what it holds."""
+    """Refuse an opcode that allocates as much as a pickle says, or that hashes its contents."""
     raise pickle.UnpicklingError("it holds a set or a bytearray")
 
 
@@ -207,7 +208,7 @@ _ALLOWED: dict[tuple[str, str], Any] = {
 }
 
 
-class _Unpickler(pickle._Unpickler):  # in Python: the one in C allocates as much as a pickle's memo index says
+class _Unpickler(pickle._Unpickler):  # the Python version: the one in C allocates as much as a pickle's memo index says
     dispatch: ClassVar = {
         **pickle._Unpickler.dispatch,
         **{code[0]: _refused for code in (pickle.BYTEARRAY8, pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET)},
@@ -226,8 +227,8 @@ class _Unpickler(pickle._Unpickler):  # in Python: the one in C allocates as muc
 
 
 def _plain(value: Any, done: dict[int, Any]) -> Any:
-    """Return `value` with its stand-ins replaced by what they stand for. done: results by identity, so that an object
-    that occurs many times is converted once."""
+    """Return `value` with its stand-ins replaced by the data that they represent. done: results by identity, so that an
+    object that occurs many times is converted once."""
     if not isinstance(value, _StandIn | dict | list | tuple):
         return value
     if id(value) not in done:

@@ -1,18 +1,18 @@
-"""The stature of a person who stands on world height 0, by a single camera, which tells whether that is the ground."""
+"""A person's stature, measured by a single camera as if they stood at height 0; it tells whether that is the ground."""
 
 import numpy as np
 
 from hnerf.geometry.camera import Camera
 
 STANDING_M = (1.2, 2.1)
-NEAR_STATURE = (0.85, 1.2)  # the same, relative to a stature that is known
+NEAR_STATURE = (0.85, 1.2)  # the same, relative to a known stature
 NOSE, SOLES, ANKLES = 0, (19, 21, 22, 24), (11, 14)  # of BODY_25; soles: big toes and heels
 NOSE_SHARE, ANKLE_SHARE = 0.92, 0.039  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.936)
 
 
 def is_standing(measured_m: float, stature_m: float | None) -> bool:
-    """Return whether a stature that was measured on height 0 is that of the person, or of any if theirs is not known;
-    False if it is NaN."""
+    """Return whether a stature measured at height 0 matches the person's or, if that is not known, anybody's; False if
+    it is NaN."""
     low, high = STANDING_M if stature_m is None else (share * stature_m for share in NEAR_STATURE)
     return low <= measured_m <= high
 
@@ -21,9 +21,9 @@ def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float
     """Return the person's stature H if they stand on height 0: the median over frames; NaN if never seen.
 
     The standing foot is where a ray to a toe or heel meets height 0 closest to the camera: rays to a lifted foot meet
-    it farther away. Where no toe or heel is ever seen, ankles stand for them, ANKLE_SHARE of H higher. If the ray to
-    the nose falls r times as steeply as the one to the foot, a camera at height c sees the nose at c - r (c -
-    ANKLE_SHARE H), which is NOSE_SHARE H. keypoints (frames, 25, 3).
+    it farther away. If no toe or heel is ever seen, ankles replace them, ANKLE_SHARE of H higher. If the ray to the
+    nose falls r times as steeply as the one to the foot, a camera at height c sees the nose at c - r (c - ANKLE_SHARE
+    H), which is NOSE_SHARE H. keypoints (frames, 25, 3).
     """
     vertical = "xyz".index(up)
     origin = camera.centre_m

@@ -1,5 +1,5 @@
-"""Choice of the subject among detected people: whom most cameras see longest and largest, or whom `capture.toml`
-names."""
+"""Choice of the subject among detected people: the one seen by most cameras, longest and largest, or the one that
+`capture.toml` names."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import resampling
 from hnerf.geometry.triangulation import triangulate
 
-EQUAL_CLAIM = 0.9  # share of the best claim from which another person may as well be meant
+EQUAL_CLAIM = 0.9  # share of the best claim above which another person could equally be meant
 MIDDLE = (1, 8)  # neck and mid-hip: where a person stands
 
 
@@ -27,9 +27,9 @@ def ranked_people(capture: Capture) -> list[PersonTrack]:
     """Return the people in the training cameras, the subject first.
 
     The subject is the person that `capture.subject_point` names, else the one with the best claim
-    (`hnerf.capture.people`) among those who move: a poster does not. Raises InputError where no frame shows a person in
+    (`hnerf.capture.people`) among those who move: a poster does not. Raises InputError if no frame shows a person in
     two cameras (in one, if there is only one), nobody is where the point is, or two people have an equal claim. Cameras
-    that all stand at one place are not calibrated yet; then each chooses for itself.
+    that are all at one position are not calibrated yet; then each chooses separately.
     """
     people = _detected(capture)
     if all(found.shape[1] == 1 for found in people):
@@ -61,8 +61,7 @@ def _equal(first: PersonTrack, second: PersonTrack) -> bool:
 
 
 def _detected(capture: Capture) -> list[np.ndarray]:
-    """Return the people in each training camera, (frames, P, 25, 3). Raises InputError where too few cameras have
-    some."""
+    """Return the people in each training camera, (frames, P, 25, 3). Raises InputError if too few cameras have any."""
     names = capture.train_cameras
     people = []
     for name in names:
@@ -79,7 +78,7 @@ def _detected(capture: Capture) -> list[np.ndarray]:
 
 
 def _too_few(names: tuple[str, ...], seen: np.ndarray) -> str:
-    """Return what is wrong with cameras that see somebody, (C, frames) bool, in no frame together."""
+    """Return the message for cameras of which no two see somebody in the same frame. seen: (C, frames) bool."""
     by = [name for name, frames in zip(names, seen, strict=True) if frames.any()]
     if len(by) == 1 and len(names) > 1:
         return (
@@ -108,7 +107,7 @@ def _distance(capture: Capture, point: SubjectPoint, person: PersonTrack) -> flo
         raise InputError(
             f"{capture.name}: the subject is named in camera {point.camera}, which is left out; name another"
         )
-    frame = np.abs(np.array(capture.frames) - point.frame).argmin()  # its own may have been left out
+    frame = np.abs(np.array(capture.frames) - point.frame).argmin()  # the named frame may have been left out
     keypoints = person.keypoints[capture.train_cameras.index(point.camera), frame]
     seen = keypoints[keypoints[:, 2] > 0, :2]
     return float(np.linalg.norm(seen - point.at, axis=-1).min()) if len(seen) else np.inf

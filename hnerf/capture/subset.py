@@ -58,7 +58,7 @@ def subset(
 
 
 def _subject_point(capture: Capture, kept: Capture) -> SubjectPoint | None:
-    """Return the point that names the subject; where its camera or frame is left out, a keypoint of the person in
+    """Return the point that names the subject; if its camera or frame is left out, a keypoint of the subject in
     another."""
     point = capture.subject_point
     if point is None or not point.camera or capture.keypoints(point.camera) is None:
@@ -79,8 +79,8 @@ def write_arrays(
     change: PointChange = lambda _, points: points,
     shown: Mapping[str, tuple[int, ...]] | None = None,
 ) -> None:
-    """Write keypoints, hands, landmarks and given poses of the frames and cameras that are kept, all points in images
-    (frames, ..., 3) changed by `change(camera, points)`. shown: as in `copy_pixels`, by camera."""
+    """Write keypoints, hands, landmarks and given poses of the kept frames and cameras. `change(camera, points)` is
+    applied to all image points (frames, ..., 3). shown: as in `copy_pixels`, by camera."""
     frames = dict.fromkeys(kept.cameras, kept.frames) | dict(shown or {})
     rows = {name: np.searchsorted(capture.frames, frames[name]) for name in kept.cameras}
     for file, read in ((KEYPOINTS, capture.keypoints), (HANDS, capture.hands)):
@@ -106,15 +106,15 @@ def read_keypoints(capture: Capture) -> dict[str, np.ndarray]:
 
 
 def write_points(path: Path, points: dict[str, np.ndarray]) -> None:
-    """Write arrays of points by name, and no file where there are none."""
+    """Write arrays of points by name; no file if there are none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if points:
         np.savez_compressed(path, **points)  # type: ignore[arg-type]
 
 
 def copy_pixels(capture: Capture, kept: Capture, camera: str, shown: tuple[int, ...] | None = None) -> None:
-    """Copy one camera's images, clean plate, given masks and detected person masks, file by file, unchanged. shown: the
-    capture's frame that each of the kept frames shows; None for the same."""
+    """Copy one camera's images, clean plate, given masks and detected person masks, file by file, unchanged. shown: for
+    each kept frame, the capture's frame that it shows; None for the same."""
     for folder in ("images", "masks", PERSON):
         stored = {path.stem: path for path in (capture.root / folder / camera).glob("*")}
         for frame, source in zip(kept.frames, shown or kept.frames, strict=True):

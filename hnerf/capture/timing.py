@@ -1,4 +1,4 @@
-"""Cameras that are not synchronised: keypoints between frames, and the frame nearest to an instant.
+"""Unsynchronised cameras: keypoints between frames, and the frame nearest to an instant.
 
 Instants are counted in recorded frames: camera c with offset o recorded the instant of frame f in its own frame f + o.
 """
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-MAX_STEP_OF_PERSON = 0.3  # of a person's height: mean movement of keypoints from one frame to the next at most
+MAX_STEP_OF_PERSON = 0.3  # of a person's height: maximum mean movement of keypoints from one frame to the next
 
 
 def nearest_frame(frame: int, offset_frames: float, step: int = 1) -> int:
@@ -17,18 +17,18 @@ def nearest_frame(frame: int, offset_frames: float, step: int = 1) -> int:
 
 
 def median_step(frames: Sequence[int]) -> int:
-    """Return the median distance of neighbours among these frames (at least one, in order)."""
+    """Return the median difference between neighbouring frame numbers (at least one, in order)."""
     return int(np.median(np.diff(frames))) if len(frames) > 1 else 1
 
 
 def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray, in_order: bool = False) -> np.ndarray:
     """Resample keypoints (n, people, K, 3) of recorded frames (n,) at other instants (m,): (m, people, K, 3). People
-    are found again by where they are, however frames list them; in_order: as all frames list them, like left and right
-    hands.
+    are matched between frames by position, in whatever order frames list them; in_order: by the order that all frames
+    share, as for left and right hands.
 
     Interpolates linearly between neighbours one median step apart; elsewhere (where a recording ends or jumps) takes
-    the frame within half such a step, or nobody without one. A keypoint that only the nearer neighbour shows is taken
-    from there.
+    the frame within half such a step, or nobody if there is none. A keypoint that only the nearer neighbour shows is
+    taken from there.
     """
     recorded = np.asarray(frames)
     after = np.searchsorted(recorded, instants).clip(1, max(1, len(recorded) - 1)) % len(recorded)
@@ -47,8 +47,8 @@ def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray,
 
 
 def _between(near: np.ndarray, far: np.ndarray, weight: float) -> np.ndarray:
-    """Return people (P, K, 3) between two frames, with `weight` for the near one; a person in one frame only stays as
-    in that frame."""
+    """Return people (P, K, 3) between two frames, with `weight` for the near one; a person without a match stays as in
+    the near frame."""
     mixed = near.copy()
     distances = np.stack([[_distance(a, b) for b in far] for a in near])
     for a, b in zip(*linear_sum_assignment(distances), strict=True):
@@ -65,7 +65,8 @@ def _mixed(near: np.ndarray, far: np.ndarray, weight: float) -> np.ndarray:
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the mean distance of two people's common keypoints (K, 3), in heights of the taller; 1 without any."""
+    """Return the mean distance of two people's common keypoints (K, 3), in heights of the taller, at most 1; 1 without
+    any."""
     both = (a[:, 2] > 0) & (b[:, 2] > 0)
     if not both.any():
         return 1.0

@@ -23,7 +23,7 @@ from hnerf.capture.safe_io import (
 from hnerf.capture.video_metadata import focal_35mm
 from hnerf.errors import InputError
 
-USUAL_FOCAL = 0.85  # of an image's longer side, 61 degrees across it: a phone's main camera as it films
+USUAL_FOCAL = 0.85  # of an image's longer side, 61 degrees across it: a phone's main camera when filming
 DIAGONAL_35MM = 43.27  # of a frame of 36 x 24 mm, to which equivalent focal lengths refer
 
 
@@ -35,8 +35,8 @@ class KnownLens(NamedTuple):
 
 
 def cameras_without_calibration(folder: Path) -> list[str]:
-    """Return the cameras whose images or videos lie in a folder without poses of cameras: the folders of images/, else
-    the videos of videos/, else those of the folder itself; none where there are none."""
+    """Return the cameras of a folder without camera poses: one for each folder in images/, else for each video in
+    videos/, else for each video in the folder itself; possibly none."""
     images = path_in_capture(folder, "images")
     folders = [path for path in sorted(images.iterdir()) if path.is_dir()] if images.is_dir() else []
     if folders:
@@ -51,10 +51,10 @@ def videos_in(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Uncalibrated(Layout):
-    """A recording of which the poses of the cameras are not known: all cameras stand at the origin.
+    """A recording whose camera poses are unknown: all cameras are at the origin.
 
-    lens_file: intrinsics, in `intri.yml` or in a TOML of cameras; fov_deg: of all others, across the longer side;
-    only: the one camera to read, else all.
+    lens_file: intrinsics, in `intri.yml` or in a TOML of cameras; fov_deg: field of view of all other cameras, across
+    the longer side; only: the one camera to read, else all.
     """
 
     lens_file: Path | None = None
@@ -63,9 +63,9 @@ class Uncalibrated(Layout):
 
     @cached_property
     def known_lenses(self) -> dict[str, KnownLens]:
-        """Return what is known of each camera's lens: from the lens file, or what `intri.yml` has that an earlier
-        calibration did not estimate, the field of view, the metadata of images or videos, in this order, or a guess.
-        Raises InputError where a file cannot be read."""
+        """Return each camera's lens from the first source that has it: the lens file, or without one `intri.yml` except
+        what an earlier calibration estimated; the field of view; the metadata of images or videos; a guess. Raises
+        InputError if a file cannot be read."""
         names = [name for name in cameras_without_calibration(self.folder) if self.only in (None, name)]
         own = path_in_capture(self.folder, "intri.yml")
         file = self.lens_file or (own if own.exists() else None)
@@ -91,7 +91,7 @@ class Uncalibrated(Layout):
 
     @cached_property
     def _opened(self) -> dict[str, Footage]:
-        """Return the footage that was asked for so far: to open a video is to decode all of it."""
+        """Return the footage opened so far, as a cache: opening a video decodes all of it."""
         return {}
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
@@ -100,8 +100,8 @@ class Uncalibrated(Layout):
 
 
 def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLens:
-    """Return a lens without distortion, at the origin, whose field of view across the longer side is given, in the
-    metadata of the first image or of the video, or usual."""
+    """Return a lens without distortion, at the origin, whose field of view across the longer side is the given one,
+    else that in the metadata of the first image or the video, else the usual one."""
     first = next(footage.read(footage.frames[:1]))
     height_px, width_px = first.rgb.shape[:2]
     longer_px = max(width_px, height_px)
@@ -118,7 +118,7 @@ def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLe
 
 
 def read_lenses(path: Path) -> dict[str, Lens]:
-    """Return the lenses of a file of intrinsics, whose poses, if it has any, are not read."""
+    """Return the lenses of a file of intrinsics; poses in it, if any, are not read."""
     if path.suffix.lower() in (".yml", ".yaml"):
         return read_intrinsics(path)
     tree = read_toml(path)

@@ -11,17 +11,17 @@ from hnerf.capture.safe_io import VIDEO_SUFFIXES
 EXIF_IFD, EXIF_FOCAL_35MM = 0x8769, 0xA405
 KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 MAX_METADATA_BYTES = 16_000_000
-# Of QuickTime's well-known types 21 (signed), 22 (unsigned), 23 and 24 (floats), by their number of bytes.
+# `struct` formats of QuickTime's well-known types 21 (signed), 22 (unsigned), 23 and 24 (floats), by number of bytes.
 FORMATS = {(21, 1): ">b", (21, 2): ">h", (21, 4): ">i", (22, 1): ">B", (22, 2): ">H", (22, 4): ">I", (23, 4): ">f",
            (24, 8): ">d"}  # fmt: skip
 
 
 def focal_35mm(path: Path) -> float | None:
-    """Return the focal length in millimetres, as of a 35 mm film, that an image or a video states; None where it states
-    none that can be read."""
+    """Return the 35 mm equivalent focal length in millimetres that an image or a video states; None if it states no
+    readable one."""
     try:
         found = _of_video(path) if path.suffix.lower() in VIDEO_SUFFIXES else _of_image(path)
-    except (Image.DecompressionBombError, OSError, OverflowError, SyntaxError, ValueError):  # whoever reads it says so
+    except (Image.DecompressionBombError, OSError, OverflowError, SyntaxError, ValueError):  # whoever reads it reports
         return None
     return found if found and 1 <= found <= 2000 else None
 
@@ -42,7 +42,7 @@ def _of_video(path: Path) -> float | None:
 
 
 def _stated(meta: bytes) -> float | None:
-    """Return the value of Apple's key in a box of metadata."""
+    """Return the value of Apple's key in a metadata box."""
     parts = dict(boxes(meta)) or dict(boxes(meta[4:]))  # a full box in MP4, a plain one in QuickTime
     keys = parts.get(b"keys", b"")
     names = [content for _, content in boxes(keys[8:])]

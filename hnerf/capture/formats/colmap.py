@@ -1,4 +1,4 @@
-"""COLMAP models, `sparse/0/{cameras,images}.{bin,txt}`: world to camera, pixel centres at one half.
+"""COLMAP models, `sparse/0/{cameras,images}.{bin,txt}`: world to camera, pixel centres at half-integers.
 
 Images and everything else are laid out as in the EasyMocap layout; a model's image `01.jpg` or `01/000000.jpg` is
 camera `01`. COLMAP's own reader trusts the counts in a binary file and can fill the memory; it accepts some truncated
@@ -23,8 +23,8 @@ PIXEL_CENTRE = 0.5  # in COLMAP; here pixel centres have integer coordinates
 MAX_BYTES = 256_000_000
 POINT_BYTES = 24  # x, y, number of the 3-D point
 
-# COLMAP's src/colmap/sensor/models.h: number in binary files, and the places of its parameters among
-# fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6 (a single focal length is both fx and fy).
+# COLMAP's src/colmap/sensor/models.h: a model's number in binary files, and the positions of its parameters among fx fy
+# cx cy k1 k2 p1 p2 k3 k4 k5 k6 (a single focal length is both fx and fy).
 FX_FY = (0, 1)
 MODELS: dict[str, tuple[int, tuple[tuple[int, ...], ...]]] = {
     "SIMPLE_PINHOLE": (0, (FX_FY, (2,), (3,))),
@@ -173,7 +173,7 @@ def _shots_from_text(path: Path) -> list[_Shot]:
 
 
 def _lines(path: Path) -> list[str]:
-    """Return the lines that are no comments, without trailing blank ones."""
+    """Return the lines that are not comments, without trailing blank ones."""
     text = read_text(path, MAX_BYTES)
     return [line.strip() for line in text.rstrip().split("\n") if not line.startswith("#")]
 

@@ -45,8 +45,8 @@ class EasyMocap(Layout):
         return Video.open(video)
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return openpose/<camera>/<frame>_keypoints.json by frame, else pose/<camera>_json/*.json, where Pose2Sim has
-        keypoints, one for each frame: in the order of the numbers in their names, walk_9 before walk_10."""
+        """Return openpose/<camera>/<frame>_keypoints.json by frame, else Pose2Sim's pose/<camera>_json/*.json, one for
+        each frame, in the order of the numbers in their names (walk_9 before walk_10)."""
         if own := safe_io.files_in(self.folder, "openpose", camera, suffixes=safe_io.JSON_SUFFIXES):
             return dict(safe_io.numbered(own, "keypoints"))
         found = safe_io.files_in(self.folder, "pose", f"{camera}_json", suffixes=safe_io.JSON_SUFFIXES)
@@ -97,7 +97,7 @@ def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:
 
 def read_easymocap(folder: Path) -> dict[str, Lens]:
     """Return the lenses that `write_easymocap` wrote, with the same rotations to the last digit. Raises InputError if
-    they are none."""
+    they are not valid."""
     return _lenses(folder, ("Rot",))
 
 
@@ -120,13 +120,13 @@ def read_intrinsics(path: Path) -> dict[str, Lens]:
 class _CalibrationFile:
     """An OpenCV FileStorage in YAML.
 
-    It is read to strings only: on deep nesting OpenCV's own parser overflows the stack, and it allocates whatever
+    All values are read as strings: OpenCV's own parser overflows the stack on deep nesting, and allocates whatever
     matrix a file declares.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # OpenCV's header is not YAML's.
+        # OpenCV's header is not valid YAML.
         text = re.sub(r"\A%YAML:\S*", "", safe_io.read_text(path, MAX_CALIBRATION_BYTES))
         try:
             self.tree = parse_yaml_strings(text)
@@ -177,8 +177,8 @@ def _lenses(folder: Path, rotations: tuple[str, ...]) -> dict[str, Lens]:
 
 
 def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None, rotations: tuple[str, ...] = ()) -> Lens:
-    """Return the lens of one camera; at the origin without a file of extrinsics. rotations: what the rotation is called
-    there, the first that exists."""
+    """Return the lens of one camera; at the origin without a file of extrinsics. rotations: prefixes of the rotation's
+    key there, of which the first that exists is used."""
     distortion = intri.matrix(f"dist_{name}", f"D_{name}")
     width_px, height_px = sides = intri.number(f"W_{name}"), intri.number(f"H_{name}")
     if sides.count(None) == 1:

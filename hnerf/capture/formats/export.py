@@ -17,14 +17,14 @@ WRITERS: dict[str, Callable[[Path, Sequence[Lens]], None]] = {
 
 
 def write_cameras(out: Path, lenses: Sequence[Lens], layout: str) -> None:
-    """Write cameras (metres) in a layout of WRITERS into the folder `out`, which is made if need be."""
+    """Write cameras (metres) in a layout of WRITERS into the folder `out`, which is created if needed."""
     out.mkdir(parents=True, exist_ok=True)
     WRITERS[layout](out, lenses)
 
 
 def write_calibration(out: Path, lenses: Sequence[Lens], source: str, layouts: Sequence[str], pose2sim: bool) -> None:
-    """Write new cameras as a capture's folder holds them: in `intri.yml` and `extri.yml`, or, in the layout of
-    Pose2Sim, in `calibration/Calib_<source>.toml`; and in further layouts of WRITERS."""
+    """Write new cameras where a capture's folder holds them: in `intri.yml` and `extri.yml` or, for the Pose2Sim
+    layout, in `calibration/Calib_<source>.toml`; and in further layouts of WRITERS."""
     if pose2sim:
         write_cameras(out / "calibration", lenses, "aniposelib")
         (out / "calibration" / "calibration.toml").rename(out / "calibration" / f"Calib_{source}.toml")

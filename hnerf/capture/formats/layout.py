@@ -25,8 +25,8 @@ class StoredFrame(NamedTuple):
 class Layout(ABC):
     """A capture folder in one layout. Methods for what most layouts lack return nothing by default.
 
-    `mark`: a file, or a folder with a slash behind, that only this layout has; its name may have wildcards.
-    `novel_pose_share`: share of the frames for novel poses, where no `capture.toml` splits them.
+    `mark`: a file, or a folder with a trailing slash, that only this layout has; its name may have wildcards.
+    `novel_pose_share`: share of the frames for novel poses if no `capture.toml` splits them.
     """
 
     folder: Path
@@ -52,11 +52,11 @@ class Layout(ABC):
         return []
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return OpenPose JSON files, or stored frames, by frame; empty where nothing was detected for this camera."""
+        """Return OpenPose JSON files, or stored frames, by frame; empty if nothing was detected for this camera."""
         return {}
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return given person masks by frame; empty where there are none."""
+        """Return given person masks by frame; empty if there are none."""
         return {}
 
     def plate_file(self, camera: str) -> Path | None:
@@ -64,5 +64,5 @@ class Layout(ABC):
         return None
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
-        """Return the poses of a body model given for these frames; None where there are none."""
+        """Return the poses of a body model given for these frames; None if there are none."""
         return None

@@ -29,7 +29,7 @@ MAX_NUMBERS = 10_000_000  # in an array of keypoints or poses: more than an hour
 
 @dataclass(frozen=True)
 class PeopleSnapshot(Layout):
-    """A subject's folder as its publication's tools read it; the world is rotated so that Z is up."""
+    """A subject's folder as the publication's own tools read it; the world is rotated so that Z is up."""
 
     mark = "camera.pkl"
 
@@ -76,7 +76,7 @@ class PeopleSnapshot(Layout):
 
     def _one_a_frame(self, path: Path, name: str) -> int:
         """Return the number of frames. Raises InputError unless a dataset declares a row for each, before anything is
-        made of what it declares."""
+        allocated for it."""
         declared, count = _count(path, name), len(self._video.frames)
         if declared != count:
             raise InputError(f"{path}: {declared} {name} for {count} frames; give one for each")
@@ -85,7 +85,7 @@ class PeopleSnapshot(Layout):
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
         """Return the poses of reconstructed_poses.hdf5: pose (N, 72), trans (N, 3), betas (10).
 
-        Where there are more poses than masks, they are aligned at the end. A frame that is all zero was never
+        If there are more poses than masks, they are aligned at the end. A frame that is all zero was never
         reconstructed.
         """
         path = path_in_capture(self.folder, "reconstructed_poses.hdf5")
@@ -138,11 +138,11 @@ def _mask(path: Path, row: int) -> np.ndarray:
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file. Raises InputError if it cannot be read."""
-    sys.audit("open", str(path), "r", 0)  # as Python's own open says what it opens
+    sys.audit("open", str(path), "r", 0)  # announced as Python's own open does
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError):  # of damage beyond the first bytes
+    except (KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError):  # damage beyond the first bytes
         raise InputError(f"{path}: not a readable HDF5 file; get it again") from None
 
 

@@ -14,8 +14,8 @@ from hnerf.errors import InputError
 
 @dataclass(frozen=True)
 class Pose2Sim(EasyMocap):
-    """A capture folder as Pose2Sim's own tools read it: world to camera, metres, Z up; and with what else EasyMocap has
-    in its folders."""
+    """A capture folder as Pose2Sim's own tools read it: world to camera, metres, Z up; other files as in the EasyMocap
+    layout."""
 
     mark = "calibration/Calib*.toml"
     novel_pose_share: ClassVar[float] = 0.2  # the last fifth, whose motion the training frames do not contain
@@ -37,7 +37,7 @@ def camera_tables(path: Path) -> dict[str, Any]:
 
 
 def lenses_from_tables(source: Path, tables: dict[str, Any]) -> dict[str, Lens]:
-    """Return the lenses in a file's tables of cameras, by name. Raises InputError where there are none, or as
+    """Return the lenses in a file's tables of cameras, by name. Raises InputError if there are none, or as
     `lens_from_table` does."""
     lenses = [lens_from_table(source, key, table) for key, table in tables.items()]
     if not lenses:
@@ -46,7 +46,7 @@ def lenses_from_tables(source: Path, tables: dict[str, Any]) -> dict[str, Lens]:
 
 
 def lens_from_table(source: Path, key: str, table: Any) -> Lens:
-    """Return the lens in one camera's table, of the keys that aniposelib, Pose2Sim and Caliscope share. Raises
+    """Return the lens in one camera's table, from the keys that aniposelib, Pose2Sim and Caliscope share. Raises
     InputError if a key is missing or wrong."""
     try:
         if table.get("fisheye", False):

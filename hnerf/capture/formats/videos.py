@@ -1,4 +1,4 @@
-"""Just videos, without calibration: in videos/, beside each other in a folder, or one file."""
+"""Just videos, without calibration: in videos/, directly in the folder, or one file."""
 
 import dataclasses
 import logging
@@ -23,9 +23,9 @@ log = logging.getLogger("hnerf.capture")
 
 @dataclass(frozen=True)
 class Videos(EasyMocap):
-    """Videos of a person, with keypoints, masks and clean plates beside them as EasyMocap has them. One needs no
-    calibration: the camera is held level, with the lens of `intri.yml`, or the field of view that `capture.toml`
-    states. Several need each other's places."""
+    """Videos of a person, with keypoints, masks and clean plates as in the EasyMocap layout. A single video needs no
+    calibration: its camera is held level, with the lens of `intri.yml`, or the field of view that `capture.toml`
+    states. Several need their relative poses."""
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
@@ -65,8 +65,8 @@ class Videos(EasyMocap):
 
 
 def _camera_name(video: Path) -> str:
-    """Return the name of a video's file, as phones and messengers make it, where a camera can have it, else one that
-    fits."""
+    """Return the name of a video's file if a camera can have it, which those from phones and messengers may not; else
+    CAMERA."""
     try:
         return check_camera_name(video.stem, video)
     except InputError:

@@ -36,7 +36,7 @@ class ZjuMocap(Layout):
 
     @cached_property
     def images(self) -> dict[str, dict[int, PurePosixPath]]:
-        """Return the images' paths by camera, named after an image's own folder, and by frame."""
+        """Return image paths by camera and frame; a camera is named after the folder of its images."""
         try:
             rows = [[PurePosixPath(str(path)) for path in row["ims"]] for row in self._annotations["ims"]]
             names = [_camera(path) for path in rows[0]]
