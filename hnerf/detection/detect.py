@@ -32,18 +32,18 @@ from hnerf.processes import end_with_parent
 from hnerf.progress import report as report_progress
 from hnerf.progress import tracked
 
-PROGRESS_S = 0.5  # between two counts of the images that are done
+PROGRESS_S = 0.5  # between two counts of the finished images
 
 
 def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str, Any]:
-    """Write the capture into `out` with keypoints that a network finds in its training cameras; return the report,
-    with `ms`, the milliseconds an image of each camera that was looked at. No file holds them, so that the same people
-    found again are the same files.
+    """Write the capture into `out` with keypoints that a network finds in its training cameras; return the report, with
+    `ms`, the milliseconds per image of each camera processed. No file contains `ms`, so that the same detections always
+    give identical files.
 
     Cameras are distributed over as many processes as there are cores. Cameras whose landmarks are in `out` already are
-    not processed again. Test cameras are never read. Masks are of the subject; keypoints are of all people, among whom
-    `hnerf.capture.subject` chooses. Raises InputError if a network is missing, nobody is found in any image, it is not
-    clear who the subject is, or the subject is too small or always cut off.
+    not processed again. Test cameras are never read. Masks show the subject only; keypoints are of all people, from
+    whom `hnerf.capture.subject` chooses the subject. Raises InputError if a network is missing, nobody is found in any
+    image, the subject is ambiguous, or the subject is too small or always cut off.
     """
     for name in (POSE_DETECTOR, f"pose_landmark_{settings.size}.tflite"):
         model_file(name)
@@ -56,13 +56,13 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
             "feet, upright, and be no smaller than a tenth of the image"
         )
     people = to_body_25({name: people["points_px"] for name, people in found.items()}, "blazepose_33")
-    for name, points in people.items():  # what the network guesses outside the image counts as not seen
+    for name, points in people.items():  # keypoints that the network guesses outside the image count as not seen
         points *= capture.cameras[name].holds(points[..., :2])[..., None]
     shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns(KEYPOINTS), dirs_exist_ok=True)
     write_points(out / KEYPOINTS, people if alone else _with_own(capture, people))
     detected = Capture.load(out)
     ranked = ranked_people(detected)
-    if alone:  # a recording's own keypoints may lack what is hidden
+    if alone:  # a recording's own keypoints may lack hidden parts
         check_subject(capture, ranked[0])
     for name, subject in zip(capture.train_cameras, ranked[0].keypoints, strict=True):
         keep_subject(out, capture, name, subject, people[name], _load(out, name, "masks", "regions"))
@@ -74,7 +74,7 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
 
 
 def with_keypoints(capture: Capture, out: Path) -> Capture:
-    """Return the capture if it has keypoints, else one in `out` with those of the network."""
+    """Return the capture if it has keypoints, else a copy in `out` with keypoints from the network."""
     if capture.has_keypoints:
         return capture
     detect(capture, DetectionSettings(), out)
@@ -82,7 +82,7 @@ def with_keypoints(capture: Capture, out: Path) -> Capture:
 
 
 def _with_own(capture: Capture, people: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the recording's own people, completed by the network's."""
+    """Return the recording's own keypoints of people, completed by the network's."""
     own = read_keypoints(capture)
     filled = {
         name: pad_people([fill_missing(*pair) for pair in zip(own[name], points, strict=True)])
@@ -93,7 +93,7 @@ def _with_own(capture: Capture, people: dict[str, np.ndarray]) -> dict[str, np.n
 
 
 def _find_people(capture: Capture, size: str, out: Path) -> dict[str, float]:
-    """Write what `find_in_camera` writes of each camera that has none yet; return what it returns by camera."""
+    """Run `find_in_camera` for each camera without complete landmarks in `out`; return its results by camera."""
     waiting = [name for name in capture.train_cameras if not _is_whole(out / LANDMARKS / f"{name}.npz")]
     if len(waiting) < 2:
         return {name: find_in_camera(capture, name, size, out) for name in waiting}
@@ -110,7 +110,7 @@ def _find_people(capture: Capture, size: str, out: Path) -> dict[str, float]:
                     job.result()
                 images = sum(len(list((out / PERSON / name).glob("*.png"))) for name in jobs.values())
                 report_progress("detection", images, len(jobs) * len(capture.frames))
-        except BaseException:  # SIGTERM and Ctrl-C as well: the pool would wait for all cameras
+        except BaseException:  # including SIGTERM and Ctrl-C: the pool would wait for all cameras
             for worker in multiprocessing.active_children():
                 worker.terminate()
             raise
@@ -118,8 +118,7 @@ def _find_people(capture: Capture, size: str, out: Path) -> dict[str, float]:
 
 
 def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> float:
-    """Write one camera's masks, and then `landmarks/<camera>.npz`, whole or not at all; return the milliseconds an
-    image.
+    """Write one camera's masks, and then, atomically, `landmarks/<camera>.npz`; return the milliseconds per image.
 
     The file holds `points_px` (frames, people, 33, 3): x, y, confidence; `points_m` (frames, people, 33, 3); `masks`
     (frames, people, 256, 256) uint8 in `regions` (frames, people, 4): centre x and y, side, angle.
@@ -143,7 +142,7 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> float
             masks=_by_frame(everybody, lambda person: person.mask, (SIZE, SIZE), np.uint8),
             regions=_by_frame(everybody, lambda person: np.array([*person.region.centre_px, *person.region[1:]]), (4,)),
         )
-    os.sync()  # the masks as well: this file says that they are whole
+    os.sync()  # the masks as well: this file's existence means that they are complete
     os.replace(beside, path)
     return 1e3 * (time.perf_counter() - started) / len(capture.frames)
 
@@ -154,7 +153,7 @@ def _by_frame(
     shape: tuple[int, ...],
     dtype: type = np.float64,
 ) -> np.ndarray:
-    """Return a value of each person in each frame as one array (frames, people, *shape), 0 where nobody is."""
+    """Return a value of each person in each frame as one array (frames, people, *shape), 0 for absent people."""
     return pad_people([np.array([value(p) for p in people], dtype).reshape(-1, *shape) for people in everybody])
 
 
@@ -172,7 +171,7 @@ def _eight_bit(likely: np.ndarray) -> np.ndarray:
 
 
 def _is_whole(path: Path) -> bool:
-    """Return whether a file of landmarks is there, with all its bytes."""
+    """Return whether a landmark file exists and is complete."""
     try:
         with ZipFile(path) as stored:
             return stored.testzip() is None
@@ -181,12 +180,12 @@ def _is_whole(path: Path) -> bool:
 
 
 def _load(out: Path, camera: str, *names: str) -> dict[str, np.ndarray]:
-    """Return some of what `find_in_camera` stored; all masks would fill the memory."""
+    """Return the named arrays that `find_in_camera` stored; all masks would not fit into memory."""
     with np.load(out / LANDMARKS / f"{camera}.npz", allow_pickle=False) as stored:
         return {name: stored[name] for name in names}
 
 
 def _summary(people: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Count the images, those with somebody and the most people in one."""
+    """Return the number of images, the number with somebody, and the most people in one image."""
     seen = np.any(people["points_px"][..., 2] > 0, axis=-1)  # (frames, people)
     return {"images": len(seen), "seen": int(seen.any(1).sum()), "people": int(seen.sum(1).max())}

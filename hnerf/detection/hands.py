@@ -1,5 +1,5 @@
-"""Hands: 21 points of either hand of the subject, by MediaPipe's hand network (Zhang et al. 2020), searched for where
-the forearm ends."""
+"""Hands: 21 points of each of the subject's hands, found by MediaPipe's hand network (Zhang et al. 2020) where the
+forearm ends."""
 
 import math
 import shutil
@@ -21,14 +21,14 @@ from hnerf.side_by_side import side_by_side
 
 SIZE, POINTS = 224, 21
 SIDES = ((6, 7), (3, 4))  # elbow and wrist of the left and of the right arm in BODY_25
-REACH, SIDE = 0.45, 1.2  # from the wrist to the middle of the hand, and side of the region, in forearms
-SHORTEST = 0.1  # of a forearm, in heights of the person: one that points at the camera looks shorter
-PASSES = 2  # the second looks where the first found the hand
-PALM = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # points that give the next region
-KNUCKLES = ([9], [5, 13])  # the direction of the hand: half by the middle finger's, half by its neighbours'
+REACH, SIDE = 0.45, 1.2  # distance from wrist to middle of the hand, and side of the region, in forearm lengths
+SHORTEST = 0.1  # forearm length in heights of the person: a forearm that points at the camera looks shorter
+PASSES = 2  # the second searches where the first found the hand
+PALM = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # points that determine the next region
+KNUCKLES = ([9], [5, 13])  # the hand's direction: half from the middle finger's, half from its neighbours'
 AHEAD, AROUND = 0.1, 2.0  # of the next region: shift towards the finger tips, and side, in sizes of the palm
-FAR = 0.5  # of the region's side: a wrist farther from the body's is not of this hand
-SAME = 0.25  # of the region's side: median distance of the points of one hand, found twice
+FAR = 0.5  # of the region's side: a hand whose wrist is farther from the body's is another hand
+SAME = 0.25  # of the region's side: median point distance below which two hands are the same one
 FOUND = 0.5  # confidence above which a hand counts as found, in the report
 
 
@@ -36,7 +36,7 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
     """Write the capture into `out` with the subject's hands in its training cameras; return the share of hands found by
     camera.
 
-    Test cameras are never read. Raises InputError if the network is missing, or nobody is the subject.
+    Test cameras are never read. Raises InputError if the network is missing or there is no subject.
     """
     cv2.setNumThreads(1)
     of_thread, people = _NetworkOfThread(), subject_keypoints(capture)
@@ -71,7 +71,7 @@ class HandNetwork:
 
 
 class _NetworkOfThread(threading.local):
-    """The hand network of each thread that asks for it: it is not safe to share."""
+    """One hand network per thread: it is not safe to share."""
 
     def __init__(self) -> None:
         self.network = HandNetwork()
@@ -79,7 +79,7 @@ class _NetworkOfThread(threading.local):
 
 def find_hands(image: np.ndarray, keypoints: np.ndarray, network: HandNetwork) -> np.ndarray:
     """Return the left and the right hand, (2, 21, 3), of the person with BODY_25 keypoints (25, 3) in an image: x_px,
-    y_px, confidence, which is 0 where the forearm is not seen or the points are of something else."""
+    y_px, confidence, which is 0 if the forearm is not seen or the points belong to something else."""
     hands = np.zeros((2, POINTS, 3))
     sides_px, height_px = np.zeros(2), float(person_heights_px(keypoints[None])[0])
     for hand, (elbow, wrist) in enumerate(SIDES):
@@ -100,7 +100,7 @@ def find_hands(image: np.ndarray, keypoints: np.ndarray, network: HandNetwork) -
 
 
 def forearm_region(elbow_px: np.ndarray, wrist_px: np.ndarray, height_px: float) -> Region:
-    """Return the region, fingers up, where the hand of a forearm must be. height_px: of the person in the image."""
+    """Return the region, fingers up, in which a forearm's hand must be. height_px: of the person in the image."""
     along = wrist_px - elbow_px
     length_px = float(np.linalg.norm(along))
     return Region(wrist_px + REACH * along, SIDE * max(length_px, SHORTEST * height_px), _angle(along))
@@ -117,5 +117,5 @@ def hand_region(points_px: np.ndarray) -> Region:
 
 
 def _angle(up: np.ndarray) -> float:
-    """Return the angle of a region whose upper side lies in a direction of the image."""
+    """Return the angle of a region whose upper side points in a direction `up` in the image."""
     return math.pi / 2 - math.atan2(-up[1], up[0])

@@ -1,4 +1,4 @@
-"""BlazePose's landmark network: 33 keypoints of the person in a region, the same in metres, and a soft mask."""
+"""BlazePose's landmark network: 33 keypoints of the person in a region, in pixels and in metres, and a soft mask."""
 
 from typing import NamedTuple
 
@@ -7,8 +7,8 @@ import numpy as np
 from hnerf.detection.network import Network, sigmoid
 from hnerf.detection.region import Region, region_around
 
-SIZE, POINTS = 256, 33  # two auxiliary points, which follow, say where the next region is
-HEAT_WINDOW, MIN_HEAT = 3, 0.5  # cells on each side of a point, and the heat that one of them must have
+SIZE, POINTS = 256, 33  # followed by two auxiliary points, which determine the next region
+HEAT_WINDOW, MIN_HEAT = 3, 0.5  # cells on each side of a point, and the least maximum of heat among them
 MIN_PRESENCE = 0.5  # probability that a region shows a person; below it, nobody is there
 
 
@@ -32,7 +32,7 @@ class LandmarkNetwork:
         self._network = Network(f"pose_landmark_{size}.tflite")
 
     def __call__(self, image: np.ndarray, region: Region) -> Person | None:
-        """Return the person in a region of an image (H, W, 3) uint8 RGB; None if there is nobody."""
+        """Return the person in a region of an image (H, W, 3) uint8 RGB; None if nobody is there."""
         raw, presence, mask, heat, metric = self._network(region.crop(image, SIZE) / 255)
         if presence[0] < MIN_PRESENCE:
             return None
@@ -48,7 +48,8 @@ class LandmarkNetwork:
 
 
 def refine_by_heatmap(places: np.ndarray, heat: np.ndarray) -> np.ndarray:
-    """Return places (n, 2) in the crop, moved to the mean of the heatmap (h, w, n) around them where it is high."""
+    """Return places (n, 2) in the crop, moved to the weighted mean of the heatmap (h, w, n) around them if it is high
+    there."""
     height, width = heat.shape[:2]
     moved = places.copy()
     for k, (x, y) in enumerate(places / SIZE * (width, height)):

@@ -1,15 +1,15 @@
-"""Completion of a recording's own keypoints by those of a network."""
+"""Completion of a recording's own keypoints with those of a network."""
 
 import numpy as np
 
 from hnerf.capture.people import person_heights_px
 
-MATCH_SHARE = 0.15  # of a person's height: median distance of the keypoints of one person, found twice
+MATCH_SHARE = 0.15  # of a person's height: median keypoint distance up to which two detections are one person
 
 
 def fill_missing(own: np.ndarray, network: np.ndarray) -> np.ndarray:
-    """Return the recording's people (P, 25, 3) in one image, with keypoints that they lack taken from the network's
-    people (Q, 25, 3); the network's people if the recording has nobody. x_px, y_px, confidence; 0 where absent."""
+    """Return the recording's people (P, 25, 3) in one image, with missing keypoints taken from the network's people (Q,
+    25, 3); the network's people if the recording has none. x_px, y_px, confidence; 0 where absent."""
     if not (own[..., 2] > 0).any():
         return network
     filled = own.copy()
@@ -21,7 +21,7 @@ def fill_missing(own: np.ndarray, network: np.ndarray) -> np.ndarray:
 
 
 def nearest_person(person: np.ndarray, others: np.ndarray) -> int | None:
-    """Return which of (Q, 25, 3) is nearest to a person (25, 3), or None if none is near enough."""
+    """Return the index of the one of (Q, 25, 3) nearest to a person (25, 3); None if none is near enough."""
     best, nearest = None, MATCH_SHARE * float(person_heights_px(person[None])[0])
     for i, other in enumerate(others):
         both = (person[:, 2] > 0) & (other[:, 2] > 0)
@@ -33,7 +33,7 @@ def nearest_person(person: np.ndarray, others: np.ndarray) -> int | None:
 
 
 def pad_people(people: list[np.ndarray]) -> np.ndarray:
-    """Stack what each frame holds of its people, (P, ...), as (frames, most people, ...); absent people are 0."""
+    """Stack each frame's array of its people, (P, ...), as (frames, most people, ...); absent people are 0."""
     most = max(1, *(len(found) for found in people))
     rows = np.zeros((len(people), most, *people[0].shape[1:]), people[0].dtype)
     for row, found in zip(rows, people, strict=True):

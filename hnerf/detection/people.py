@@ -1,4 +1,4 @@
-"""Who was taken for the subject and who was left: whether the subject can be used, masks, figures, a picture."""
+"""The chosen subject and the other people: check of the subject, masks, figures and an image for the report."""
 
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ from hnerf.detection.region import Region
 from hnerf.errors import InputError
 
 REPORT, PICTURE = "detection.json", "people.png"
-MIN_HEIGHT_PX = 80  # in an image; the networks look at 256 x 256 px around a person
+MIN_HEIGHT_PX = 80  # in an image; the networks use 256 x 256 px around a person
 WHOLE = (2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14)  # arms and legs, without which no pose is known
-PICTURE_PX = 360  # height of each camera's image in the picture
+PICTURE_PX = 360  # height of each camera's image in PICTURE
 TAKEN, LEFT = (0, 200, 0), (220, 0, 0)
 
 
@@ -41,10 +41,10 @@ def check_subject(capture: Capture, subject: PersonTrack) -> None:
 def keep_subject(
     out: Path, capture: Capture, camera: str, subject: np.ndarray, people: np.ndarray, found: dict[str, np.ndarray]
 ) -> None:
-    """Write the masks anew of the images of a camera in which others are, or in which the subject is not.
+    """Rewrite the masks of those images of a camera that show other people, or that do not show the subject.
 
-    subject (frames, 25, 3); people (frames, P, 25, 3): all whom the network found, in the order of `masks` and
-    `regions` in `found`. A pixel that is likelier another's is not the subject's.
+    subject (frames, 25, 3); people (frames, P, 25, 3): everybody whom the network found, in the order of `masks` and
+    `regions` in `found`. A pixel more likely to show another person is not the subject's.
     """
     size_px = capture.cameras[camera].size_px
     for i, frame in enumerate(capture.frames):
@@ -61,14 +61,14 @@ def keep_subject(
 
 
 def _pasted(found: dict[str, np.ndarray], row: int, person: int, size_px: tuple[int, int]) -> np.ndarray:
-    """Return the mask of a person in the image, (H, W) float32 up to 255."""
+    """Return a person's mask in the image, (H, W) float32 up to 255."""
     x, y, side_px, angle = found["regions"][row, person]
     region = Region(np.array([x, y]), side_px, angle)
     return region.paste(found["masks"][row, person].astype(np.float32), size_px)
 
 
 def people_rows(capture: Capture, people: list[PersonTrack]) -> list[dict[str, Any]]:
-    """Return plain values of each person, the subject first."""
+    """Return the report's values for each person, the subject first."""
     rows = []
     for i, person in enumerate(people):
         seen = np.asarray((person.keypoints[..., 2] > 0).any(-1))  # (C, frames)
@@ -87,7 +87,8 @@ def people_rows(capture: Capture, people: list[PersonTrack]) -> list[dict[str, A
 
 
 def draw_people(path: Path, capture: Capture, people: list[PersonTrack]) -> None:
-    """Write the image of each training camera that shows most people, with the subject green and others red."""
+    """Write, for each training camera, the image that shows most people, with the subject in green and others in
+    red."""
     shown = np.stack([(person.keypoints[..., 2] > 0).any(-1) for person in people])  # (people, C, frames)
     tiles = []
     for c, camera in enumerate(capture.train_cameras):

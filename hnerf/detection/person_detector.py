@@ -9,7 +9,7 @@ from hnerf.models import POSE_DETECTOR
 SIZE = 224  # side of the network's input, px
 LAYERS = ((28, 2), (14, 2), (7, 6))  # cells on a side, and anchors in each
 MIN_SCORE = 0.5
-NMS_IOU = 0.3  # IoU above which two boxes are of one person
+NMS_IOU = 0.3  # IoU above which two boxes show one person
 
 
 def anchors() -> np.ndarray:
@@ -23,7 +23,8 @@ def anchors() -> np.ndarray:
 
 
 def decode_boxes(raw: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Decode boxes from the network's output (n, 12): centre, size and four points, in pixels from anchors (n, 2).
+    """Decode boxes from the network's output (n, 12): centre, size and four points, in pixels relative to anchors (n,
+    2).
 
     Returns (n, 6, 2), as shares of the image: low corner, high corner and the four points.
     """

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-SHRINK_BELOW = 0.75  # crop pixels an image pixel from which an image is averaged down first, against aliasing
-MARGIN = 2.5  # side over the distance from a person's middle to the end of the circle around him
+SHRINK_BELOW = 0.75  # crop pixels per image pixel below which an image is first averaged down, against aliasing
+MARGIN = 2.5  # a region's side over the radius of the circle around the person
 
 
 class Region(NamedTuple):
@@ -30,7 +30,7 @@ class Region(NamedTuple):
     def crop(self, image: np.ndarray, size: int) -> np.ndarray:
         """Resample the region of an image (H, W, 3) to (size, size, 3) uint8; black outside the image."""
         to_image = self.from_crop(size)
-        to_image[:, 2] += to_image[:, :2].sum(1) / 2  # of pixel centres at integers
+        to_image[:, 2] += to_image[:, :2].sum(1) / 2  # pixel centres at integers
         if size < SHRINK_BELOW * self.side_px:
             full = np.array(image.shape[1::-1])
             small = np.maximum(1, np.round(full * size / self.side_px)).astype(int)
@@ -53,12 +53,12 @@ class Region(NamedTuple):
 
 
 def region_around(middle_px: np.ndarray, end_px: np.ndarray) -> Region:
-    """Return the region around a person, from the middle of the hips and the end, above the head, of the radius of the
-    circle that holds the person."""
+    """Return the region around a person, given the middle of the hips and the point above the head at which the circle
+    around the person ends."""
     across, up = end_px[0] - middle_px[0], middle_px[1] - end_px[1]
     return Region(middle_px, MARGIN * math.hypot(across, up), math.pi / 2 - math.atan2(up, across))
 
 
 def image_region(size_px: tuple[int, int]) -> Region:
-    """Return the smallest region that holds an image of (width, height) px."""
+    """Return the smallest region that contains an image of (width, height) px."""
     return Region((np.array(size_px) - 1) / 2, float(max(size_px)), 0.0)

@@ -1,4 +1,4 @@
-"""Tracking of people through the images of one camera, with detection where the track is lost and at intervals."""
+"""Tracking of people through the images of one camera, with detection at intervals and when a track is lost."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -8,11 +8,11 @@ import numpy as np
 from hnerf.detection.landmarks import Person
 from hnerf.detection.region import Region
 
-REDETECT_EVERY = 10  # images, for people who came since
-MISSING_FOR = 30  # images in which somebody who is not tracked any more, behind another perhaps, is looked for in each
-MAX_PASSES = 3  # in an image, as long as each finds the person elsewhere than it looked
-MOVED, GREW = 0.1, 1.2  # in sides of the region, and times its side: what counts as elsewhere
-MATCH_SHARE = 0.1  # of a region's side, an eighth of a height: middles of two regions that are of one person
+REDETECT_EVERY = 10  # images, to find people who have come in since
+MISSING_FOR = 30  # images in each of which a lost person, hidden by another perhaps, is searched for
+MAX_PASSES = 3  # in an image, as long as each finds the person elsewhere than in the searched region
+MOVED, GREW = 0.1, 1.2  # shift in sides of the region, or factor on its side, beyond which it counts as elsewhere
+MATCH_SHARE = 0.1  # of a region's side, an eighth of a height: distance below which two regions show one person
 
 Detector = Callable[[np.ndarray], list[Region]]
 Landmarks = Callable[[np.ndarray, Region], Person | None]
@@ -32,7 +32,7 @@ def track(images: Iterable[np.ndarray], detector: Detector, landmarks: Landmarks
 
 
 def _located(image: np.ndarray, regions: list[Region], landmarks: Landmarks, known: list[Person]) -> list[Person]:
-    """Return the people known already and those found in the regions besides."""
+    """Return the already known people and any others found in the regions."""
     people = list(known)
     for region in regions:
         person = None if any(_same(region, other.next) for other in people) else _settled(image, region, landmarks)
