@@ -15,7 +15,7 @@ from hnerf.segmentation.prior import Prior, PriorOf, bounding_window
 
 CLEAN_PLATE = "clean plate"
 AROUND_BODY, AROUND_DETECTED = "median around the fitted body", "median around the detected person"
-MEDIAN_FRAMES = 60  # at most, evenly spaced, for the background without a plate
+MEDIAN_FRAMES = 60  # evenly spaced frames at most, to estimate the background without a plate
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class Given:
     name: str = "given"
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Return the given mask, reduced to the subject where the prior finds it; empty if the subject is known to be
-        outside the image. Raises InputError where it is missing."""
+        """Return the given mask, reduced to the subject if the prior finds it there; empty if the subject is known to
+        be outside the image. Raises InputError if it is missing."""
         mask = self.capture.given_mask(self.camera, frame)
         if mask is None:
             raise InputError(
                 f"masks/{self.camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none"
             )
         subject = components_within(mask, prior.reach)
-        inverted = prior.core.any() and not (subject & prior.core).any() and mask.mean() > 0.5  # and shows but a gap
+        inverted = prior.core.any() and not (subject & prior.core).any() and mask.mean() > 0.5  # and shows only a gap
         return subject if (subject.any() and not inverted) or prior.elsewhere else mask
 
 
@@ -56,7 +56,7 @@ class Learned:
 
 @dataclass(frozen=True)
 class BackgroundSubtraction:
-    """Difference to a plate, (H, W, 3) uint8 RGB, where it is `known`, (H, W) bool; then GrabCut."""
+    """Difference from a plate, (H, W, 3) uint8 RGB, where it is `known`, (H, W) bool; then GrabCut."""
 
     capture: Capture
     camera: str
@@ -69,8 +69,8 @@ class BackgroundSubtraction:
     def of(
         capture: Capture, camera: str, prior_of: PriorOf, count: int, around: str, settings: SegmentationSettings
     ) -> "BackgroundSubtraction":
-        """Use the clean plate, which is known everywhere, if there is one, else the median over at most `count` frames,
-        each where its prior leaves the background free."""
+        """Use the clean plate, which is known everywhere, if there is one, else the median over at most `count` frames
+        of the pixels that their priors leave free."""
         plate = capture.background(camera)
         if plate is not None:
             return BackgroundSubtraction(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
@@ -80,7 +80,7 @@ class BackgroundSubtraction:
         return BackgroundSubtraction(capture, camera, plate, known, settings, around)
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Return the mask cut out of the window within reach of the prior."""
+        """Return the mask, found in the window within reach of the prior."""
         image, window = self.capture.image(self.camera, frame), bounding_window(prior.reach)
         mask = np.zeros(image.shape[:2], bool)
         if not prior.reach.any():
@@ -93,7 +93,7 @@ class BackgroundSubtraction:
         return mask
 
 
-Backend = Given | Learned | BackgroundSubtraction  # a source of masks for one camera; its name is for the report
+Backend = Given | Learned | BackgroundSubtraction  # a source of masks for one camera; `name` is for the report
 
 
 def choose_backend(
@@ -103,7 +103,7 @@ def choose_backend(
     """Return the first possible source of masks: given masks, the user's network, a clean plate, then the background
     around a `fitted` body or a detected person.
 
-    Raises InputError where none is possible.
+    Raises InputError if none is possible.
     """
     if any(capture.given_mask(camera, frame) is not None for frame in capture.frames):
         return Given(capture, camera)

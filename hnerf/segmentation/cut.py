@@ -1,5 +1,4 @@
-"""From a difference and a prior to a mask: smoothed log odds, GrabCut where they are unsure, matting at the
-edge."""
+"""A mask from a difference and a prior: smoothed log odds, GrabCut where they are uncertain, matting at the edge."""
 
 import cv2
 import numpy as np
@@ -10,11 +9,11 @@ from hnerf.segmentation.prior import Prior, bounding_window, disc
 
 BODY_LOG_ODDS, CORE_LOG_ODDS = 1.0, 2.0  # added by the prior on the body, and again on its core
 UNKNOWN_LOG_ODDS = -2.0  # off the body, where the plate is unknown
-MAX_LOG_ODDS = 4.0  # of one pixel: the models of noise and shadow are no more certain
+MAX_LOG_ODDS = 4.0  # of one pixel: the noise and shadow models are no more certain than this
 SURE_LOG_ODDS = 2.0  # beyond which GrabCut may not change the label
-SMOOTH_PX, SMOOTH_GREY = 2, 7.0  # the guided filter's window, and the step in the image that it keeps
-SPECK_SHARE = 0.001  # of the mask's area: smaller parts are noise
-BAND_PX = 4  # around the likely person, where GrabCut may add to it
+SMOOTH_PX, SMOOTH_GREY = 2, 7.0  # the guided filter's window, and the image step that it preserves
+SPECK_SHARE = 0.001  # of the mask's area: smaller components are noise
+BAND_PX = 4  # width around the likely person in which GrabCut may add to it
 
 
 def cut(image: np.ndarray, found: Difference, prior: Prior, known: np.ndarray) -> np.ndarray:
@@ -22,8 +21,8 @@ def cut(image: np.ndarray, found: Difference, prior: Prior, known: np.ndarray) -
     is valid.
 
     The log odds, with those of the prior, are averaged by a guided filter (cost-volume filtering, Rhemann et al. 2011)
-    and label what is sure. GrabCut (Rother et al. 2004) decides the rest on the contrast image, from which the
-    background's texture has gone.
+    and label the pixels that are certain. GrabCut (Rother et al. 2004) decides the rest on the contrast image, which is
+    free of the background's texture.
     """
     log_odds = np.where(known, found.log_odds.clip(-MAX_LOG_ODDS, MAX_LOG_ODDS), UNKNOWN_LOG_ODDS * ~prior.body)
     log_odds = log_odds + BODY_LOG_ODDS * prior.body + CORE_LOG_ODDS * prior.core
@@ -41,7 +40,7 @@ def cut(image: np.ndarray, found: Difference, prior: Prior, known: np.ndarray) -
 
 
 def _without_specks(mask: np.ndarray) -> np.ndarray:
-    """Return a mask without its smallest parts."""
+    """Return a mask without its smallest components."""
     _, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     large = stats[:, cv2.CC_STAT_AREA] >= SPECK_SHARE * mask.sum()
     large[0] = False
@@ -49,13 +48,13 @@ def _without_specks(mask: np.ndarray) -> np.ndarray:
 
 
 def _grab_cut(picture: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Return labels after GrabCut on a tight window, so that its background model describes what surrounds the
-    person."""
+    """Return labels after GrabCut on a tight window, so that its background model describes the person's
+    surroundings."""
     window = bounding_window(labels != cv2.GC_BGD)
     inside = np.ascontiguousarray(labels[window])
     if not np.isin(inside, (cv2.GC_BGD, cv2.GC_PR_BGD)).any() or not np.isin(inside, (cv2.GC_FGD, cv2.GC_PR_FGD)).any():
         return labels
-    cv2.setRNGSeed(0)  # for k-means, by which its colour models start
+    cv2.setRNGSeed(0)  # for the k-means that initialises its colour models
     background, person = np.zeros((1, 65)), np.zeros((1, 65))
     pixels = np.ascontiguousarray(picture[window])
     cv2.grabCut(pixels, inside, (0, 0, 0, 0), background, person, 1, cv2.GC_INIT_WITH_MASK)
@@ -65,7 +64,7 @@ def _grab_cut(picture: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def components_within(mask: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Return the connected parts of a mask that lie at least half within reach: the subject, not other people."""
+    """Return the connected components of a mask that lie at least half within reach: the subject, not other people."""
     count, parts = cv2.connectedComponents(mask.astype(np.uint8))
     area = np.bincount(parts.ravel(), minlength=count)
     inside = np.bincount(parts[reach], minlength=count)

@@ -1,4 +1,4 @@
-"""Image against background: how much likelier each pixel is the person's than the background's, or its shadow's."""
+"""Image against background: log odds that each pixel shows the person rather than the background, shadowed or not."""
 
 from dataclasses import dataclass
 
@@ -9,27 +9,27 @@ from hnerf.config import SegmentationSettings
 from hnerf.segmentation.prior import Prior
 
 LOG_OFFSET = 6.0  # grey levels added before the logarithm: below them sensors and JPEG carry little information
-RATIO_NOISE = 0.01  # of log ratios, beyond the pixel's own noise: JPEG, rounding of the plate
+RATIO_NOISE = 0.01  # of log ratios, in addition to the pixel's own noise: JPEG, rounding of the plate
 SHADOW_TINT = 0.02  # log chroma per log brightness: gamma and stray light tint deep shadows a little
 SHADOW_SHARE = 0.1  # prior share of the background near a person
-MAX_GREY_SPREAD = 6  # grey levels between the channels of a grey picture: videos round its chroma, by 3 levels
-GREY_SHADOW_SHARE = 0.3  # in grey pictures, where no chroma tells a shadow from the person
-EDGE_OF_SHADOW = 0.1  # log brightness over which the density of shadows darker than the darkest falls off
-PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # std of a person's log ratio to the background
+MAX_GREY_SPREAD = 6  # grey levels between the channels of a grey image: videos round its chroma, by 3 levels
+GREY_SHADOW_SHARE = 0.3  # in grey images, in which no chroma distinguishes a shadow from the person
+EDGE_OF_SHADOW = 0.1  # log brightness over which the density of shadows falls off beyond the darkest one
+PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # standard deviations of a person's log ratio to the background
 NOISE_FACTOR = 0.8  # the robust estimate of noise counts JPEG's blocks twice
 ROUNDING = 0.5  # grey levels
-MOSTLY_FREE, MIN_FREE = 0.5, 0.02  # shares of an image, for noise and exposure
+MOSTLY_FREE, MIN_FREE = 0.5, 0.02  # shares of an image: to estimate noise, and exposure
 PIXEL_STRIDE = 15  # every 15th pixel is enough for a median
-MIN_GAIN = 0.02  # difference of exposures from one; noise and JPEG look like as much
-CONTRAST_GAIN, CONTRAST_FLOOR = 16.0, 16.0  # of the contrast image, which evens out cameras' square-root noise
-INPAINT_RADIUS_PX = 3  # of pixels that are never seen
+MIN_GAIN = 0.02  # deviation of gains from one; noise and JPEG can cause smaller ones
+CONTRAST_GAIN, CONTRAST_FLOOR = 16.0, 16.0  # of the contrast image, which equalises cameras' square-root noise
+INPAINT_RADIUS_PX = 3  # for pixels that are never seen
 HIDDEN_LEVEL = 256  # sorts after every grey level
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The comparison of an image with a plate. log_odds: (H, W) float32, of person against background, shadows
-    included; contrast: (H, W, 3) uint8, the difference as an image, grey where nothing changed; plate: (H, W, 3) uint8
+    """The comparison of an image with a plate. log_odds: (H, W) float32, of person against background, including
+    shadows; contrast: (H, W, 3) uint8, the difference as an image, grey where nothing changed; plate: (H, W, 3) uint8
     RGB, as compared."""
 
     log_odds: np.ndarray
@@ -38,7 +38,8 @@ class Difference:
 
 
 def visible_background(prior: Prior, known: np.ndarray) -> np.ndarray:
-    """Return where background is visible and `known`, (H, W) bool: as far from the person as enough of it remains."""
+    """Return where background is visible and `known`, (H, W) bool: as far from the person as possible while enough of
+    it remains."""
     for free in (~prior.reach & known, ~prior.near & known):
         if free.mean() > MIN_FREE:
             return free
@@ -46,9 +47,9 @@ def visible_background(prior: Prior, known: np.ndarray) -> np.ndarray:
 
 
 def exposure_corrected(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the plate with the brightness and tint that the image has on visible background, `free` (H, W).
+    """Return the plate with the image's brightness and tint, measured on visible background, `free` (H, W).
 
-    Automatic exposure changes when a person comes in. The plate is returned unchanged where the gains are near one.
+    Automatic exposure changes when a person comes in. The plate is returned unchanged if the gains are near one.
     """
     if not free.any():
         return plate
@@ -61,7 +62,7 @@ def exposure_corrected(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -
 def noise_level(image: np.ndarray, plate: np.ndarray, free: np.ndarray) -> float:
     """Return the standard deviation, in grey levels, of image minus plate where both show background, `free` (H, W).
 
-    All of the image is used if most of it is free: then what shadows change counts as noise, and not as the person.
+    The whole image is used if most of it is free: changes by shadows then count as noise, not as the person.
     """
     free = np.ones_like(free) if free.mean() > MOSTLY_FREE else free
     contrast = _some(image, free).astype(np.float32) - _some(plate, free)
@@ -79,8 +80,8 @@ def difference(
     """Compare images (H, W, 3) uint8 RGB. `shadowed`: the plate, a median over time, may contain shadows itself.
 
     The logarithm of their ratio splits into brightness and chroma. Unchanged background has neither; a shadow lowers
-    the brightness and hardly changes the chroma (Horprasert et al. 1999, in logarithms); a person may have any, but in
-    a grey picture has none either.
+    the brightness and hardly changes the chroma (Horprasert et al. 1999, in logarithms); a person may have any
+    brightness and chroma, but in a grey image no chroma.
     """
     lit, unlit = image.astype(np.float32) + LOG_OFFSET, plate.astype(np.float32) + LOG_OFFSET
     ratio = np.log(lit / unlit)
@@ -106,7 +107,7 @@ def _log_gaussian(squared: np.ndarray, variance: np.ndarray | float, dimensions:
 
 
 def _log_uniform(brightness: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Return the logarithm of a density of log brightness that is uniform from low to high, with soft ends."""
+    """Return the logarithm of a density over log brightness that is uniform from low to high, with soft ends."""
     beyond = (np.maximum(low - brightness, 0) + np.maximum(brightness - high, 0)) / EDGE_OF_SHADOW
     return -0.5 * beyond**2 - np.log(np.sqrt(3) * (high - low))
 
@@ -116,7 +117,8 @@ def masked_median(images: list[np.ndarray], hidden: list[np.ndarray]) -> tuple[n
     bool.
 
     It is each pixel's median over the frames in which it is not `hidden` (H, W) bool, the lighter of two middle values:
-    one in a shadow and one beside it would mix to neither. Where there is no such frame, it is inpainted (Telea 2004).
+    the mean of one in a shadow and one outside it would be neither. Pixels without such a frame are inpainted (Telea
+    2004).
     """
     behind = np.stack(hidden)
     seen = (~behind).sum(0)

@@ -7,18 +7,18 @@ import numpy as np
 
 from hnerf.errors import InputError
 
-TOLERANCE = 1e-3  # a probability may be outside [0, 1] by so much
+TOLERANCE = 1e-3  # a probability may be outside [0, 1] by this much
 
 
 class Network:
     """A network with one image input and, as its first output, a map of the person's probability.
 
-    The input is RGB in [0, 1], float32, (1, 3, H, W) or (1, H, W, 3) as the file says; where the file fixes H and W,
-    images are resized to it. The output may have leading or trailing axes of length 1.
+    The input is RGB in [0, 1], float32, (1, 3, H, W) or (1, H, W, 3) as the file states; if the file fixes H and W,
+    images are resized to them. The output may have leading or trailing axes of length 1.
     """
 
     def __init__(self, path: Path) -> None:
-        """Load a network. Raises InputError where the file or ONNX Runtime is missing, or where the file is no such
+        """Load a network. Raises InputError if the file or ONNX Runtime is missing, or if the file is no such
         network."""
         if not path.is_file():
             raise InputError(f"segmentation.model: {path}: no such file; name an ONNX file, or leave it out")
@@ -43,7 +43,7 @@ class Network:
 
     def probability(self, image: np.ndarray) -> np.ndarray:
         """Return the probability of the person, (H, W) float32 in [0, 1], in an image (H, W, 3) uint8 RGB. Raises
-        InputError where the output is not one."""
+        InputError if the output is no such map."""
         pixels = image if self.size_px is None else cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA)
         values = pixels.astype(np.float32)[None] / 255
         if self.channels_first:

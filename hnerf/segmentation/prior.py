@@ -1,4 +1,4 @@
-"""Priors on where in an image the subject is, from keypoints or from a fitted body."""
+"""Priors on the subject's position in an image, from keypoints or a fitted body."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,29 +19,29 @@ from hnerf.geometry.silhouette import silhouette
 from hnerf.geometry.triangulation import triangulate
 
 TRUNK = (2, 5, 12, 9)
-THICK = ((1, 8), (9, 10), (12, 13))  # drawn twice as thick as other limbs: trunk seen from the side, and thighs
+THICK = ((1, 8), (9, 10), (12, 13))  # drawn twice as thick as other limbs: the trunk, for side views, and thighs
 CORE_SHARE = 0.02  # of the person's height: half the width of a limb that is surely body
 MARGIN_PX = 12  # of background around the person
 NEAR_SHARE = 0.03  # of the person's height: error of a body fitted to keypoints alone
 SOLE_SHARE = 0.06  # of the person's height: extent of a shoe below the lowest keypoint
-UPRIGHT = 0.7  # least cosine between the image's and the world's vertical in an upright image
+UPRIGHT = 0.7  # minimum cosine between the image's and the world's vertical in an upright image
 HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
-LIKELY, SURE = 0.5, 0.9  # probabilities of a network from which a pixel is taken for the person's
+LIKELY, SURE = 0.5, 0.9  # probabilities of a network above which a pixel is likely, or surely, the person's
 FAR = 5  # in longer sides of the image, beyond which nothing is drawn
 FACE = (15, 16, 17, 18)
-SHOULDERS, HIP_WIDTH = (2, 5), 0.8  # of the shoulders' width, for hips that are not seen
+SHOULDERS, HIP_WIDTH = (2, 5), 0.8  # of the shoulders' width, for unseen hips
 LEGS = ((9, 10, 11, (22, 23, 24)), (12, 13, 14, (19, 20, 21)))  # hip, knee, ankle, foot
-NOSE_ABOVE_NECK, THIGH = 0.45, 0.8  # of the distance from neck to mid-hip, to place what is not seen
+NOSE_ABOVE_NECK, THIGH = 0.45, 0.8  # of the distance from neck to mid-hip, to place unseen joints
 FOOT_SHARE = 0.1  # of the person's height: extent of an unseen foot around its ankle
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the person in one image before looking at it; height_px of the person, 0 where nothing is seen
-    or `behind`: the person is behind the camera.
+    """What is known about the person in one image before looking at it. height_px: the person's, 0 if nothing is seen
+    or if the person is `behind` the camera.
 
-    (H, W) bool, each within the next: `core`, surely the person; `body`, as fitted; `near`, what a slightly wrong body
-    may cover; `reach`, the farthest extent of clothes and hair.
+    (H, W) bool, each within the next: `core`, surely the person; `body`, as fitted; `near`, the area that a slightly
+    wrong body may cover; `reach`, the farthest extent of clothes and hair.
     """
 
     core: np.ndarray
@@ -66,10 +66,9 @@ class Prior:
         upright: bool = False,
         behind: bool = False,
     ) -> "Prior":
-        """Return the prior grown around where the body is, seen or completed, (H, W) bool; reach in heights of the
-        person.
+        """Return the prior grown around the body, seen and completed, (H, W) bool; reach in heights of the person.
 
-        In an upright image, whatever is far below the lowest part of the body is its reflection.
+        In an upright image, anything far below the lowest part of the body is its reflection and is excluded.
         """
         away_px = cv2.distanceTransform(np.where(completed, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         within = away_px <= reach * height_px
@@ -84,15 +83,15 @@ class Prior:
 
 
 PriorOf = Callable[[int], Prior]
-"""Makes the prior of the frame of this number among `capture.frames`: those of a long recording do not fit into memory
+"""Makes the prior of the frame with this index in `capture.frames`: those of a long recording do not fit into memory
 together."""
 
 
 def camera_priors(
     capture: Capture, body: BodyFit | None, settings: SegmentationSettings
 ) -> Iterator[tuple[str, PriorOf]]:
-    """Yield each training camera with the priors of the fitted body, else of what a network took for a person, either
-    together with the stick figure, which it may miss; else of the stick figure alone."""
+    """Yield each training camera with priors from the fitted body, else from a network's person masks, either together
+    with the stick figure, parts of which they may miss; else from the stick figure alone."""
     prior: Callable[..., Prior] = _network_prior if capture.has_person_masks else _keypoint_prior
     if body is not None:
         vertices_m = body.vertices_m().numpy()[[body.index(f) for f in capture.frames]]
@@ -102,7 +101,7 @@ def camera_priors(
 
 
 def keypoint_priors(capture: Capture, camera: str, keypoints: np.ndarray, settings: SegmentationSettings) -> PriorOf:
-    """Return the priors of a person's stick figures in one camera, seen as keypoints (frames, 25, 3)."""
+    """Return priors from a person's stick figures in one camera, drawn from keypoints (frames, 25, 3)."""
     poses_px = _interpolated(np.where(keypoints[..., 2:] > 0, keypoints[..., :2], np.nan), capture.frames)
     return partial(_keypoint_prior, capture, camera, poses_px, settings.reach)
 
@@ -126,12 +125,12 @@ def _body_prior(
 
 
 def _network_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:
-    """Return the prior of what a network took for a person, as far as it is the subject."""
+    """Return the prior from a network's person mask, restricted to the subject."""
     likely = capture.person_probability(camera, capture.frames[number])
-    assert likely is not None  # a network looks at every image of a training camera
+    assert likely is not None  # networks process every image of a training camera
     figure = _keypoint_prior(capture, camera, poses_px, reach, number)
     covered = (likely > LIKELY) & figure.reach
-    if not covered.any():  # missed in this image
+    if not covered.any():  # the network missed the person in this image
         return figure
     core = _core(likely > SURE, figure.height_px)
     body = covered | figure.core
@@ -139,7 +138,8 @@ def _network_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: f
 
 
 def _core(covered: np.ndarray, height_px: float) -> np.ndarray:
-    """Return what lies deep enough inside (H, W) bool for a limb, in a time that does not grow with the person."""
+    """Return the pixels deep enough inside (H, W) bool to be surely a limb, in time independent of the person's
+    size."""
     depth_px = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     return np.asarray(depth_px > max(1, round(CORE_SHARE * height_px)))
 
@@ -169,9 +169,9 @@ def disc(radius_px: float) -> np.ndarray:
 def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, np.ndarray]:
     """Return keypoints (frames, 25, 2) in pixels by camera; NaN for a keypoint that is never seen.
 
-    They are triangulated and projected where several cameras see the person, which removes a detector's outliers; gaps
-    in time are interpolated; what no two cameras ever see together is left as each has it. Where the recording has no
-    keypoints, they are the body's own. What is behind a camera is infinite.
+    If several cameras see the person, keypoints are triangulated and projected, which removes a detector's outliers;
+    gaps in time are interpolated; keypoints that no two cameras ever see together stay as each camera has them. If the
+    recording has no keypoints, the body's own are used. Points behind a camera are infinite.
     """
     if body is not None and not capture.has_keypoints:
         points_m = (body.rig.keypoint_weights @ body.vertices_m()).numpy()
@@ -190,8 +190,8 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
 
 
 def _in_image(camera: Camera, points_m: np.ndarray, own_px: np.ndarray) -> np.ndarray:
-    """Return the pixels (..., 2) of points (..., 3), those in own_px (..., 2) where a point is not known, and infinity
-    where it is behind the camera."""
+    """Return the pixels (..., 2) of points (..., 3): those in own_px (..., 2) where a point is unknown, infinity where
+    it is behind the camera."""
     pixels_px, depth_m = camera.project(points_m)
     return np.where(depth_m[..., None] <= 0, np.inf, np.where(np.isfinite(pixels_px), pixels_px, own_px))
 
@@ -216,8 +216,8 @@ def _filled(tracks: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def _completed_pose(pose_px: np.ndarray) -> np.ndarray:
-    """Return a pose (25, 2) in which head, hips and legs that are not seen are placed where they are likely, in line
-    with the others."""
+    """Return a pose (25, 2) in which unseen head, hips and legs are placed where they are likely, in line with the
+    visible joints."""
     completed = pose_px.copy()
 
     def fill(joint: int, at_px: np.ndarray) -> None:
@@ -241,7 +241,7 @@ def _completed_pose(pose_px: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class _StickFigure:
     """A drawn stick figure, (H, W) bool: core, without the feet, where shadows touch the person; body, with the feet;
-    completed, also with what no keypoint shows. behind: whether all that is known of it is behind the camera."""
+    completed, also with parts that no keypoint shows. behind: whether all known points are behind the camera."""
 
     core: np.ndarray
     body: np.ndarray
@@ -251,7 +251,7 @@ class _StickFigure:
 
 
 def _stick_figure(camera: Camera, pose_px: np.ndarray) -> _StickFigure:
-    """Draw the stick figure of pose_px (25, 2), NaN where nothing is known, infinite behind the camera; clipped far
+    """Draw the stick figure of pose_px (25, 2), NaN where unknown, infinite behind the camera. It is clipped far
     outside the image, as drawing takes small integers."""
     far_px = FAR * max(camera.size_px)
     behind = np.isinf(pose_px)

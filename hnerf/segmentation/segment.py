@@ -1,4 +1,5 @@
-"""Masks of the person in every training view: given, learned, from clean plates, or else around a fitted body."""
+"""Masks of the person in every training view: given, from a network, from clean plates, or else around a fitted
+body."""
 
 import dataclasses
 import logging
@@ -25,10 +26,9 @@ log = logging.getLogger("hnerf.segmentation")
 def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettings) -> Masks:
     """Return masks for all training cameras and `capture.frames`.
 
-    A camera with given masks keeps them; the user's network comes next, then a clean plate; otherwise `body`, or the
-    person that detection found, is needed to find the background in pixels that neither reaches. Only the subject is
-    kept where there are several people. A mask that cannot be right is dropped and named in the report. Raises
-    InputError if no mask of a camera is left.
+    A camera with given masks keeps them; the user's network comes next, then a clean plate. Otherwise the background is
+    estimated from pixels out of reach of `body` or of the detected person. Of several people, only the subject is kept.
+    A mask that cannot be right is dropped and listed in the report. Raises InputError if no mask of a camera is left.
     """
     priors = camera_priors(capture, body, settings)
     network = None if settings.model is None else Network(settings.model)
@@ -50,7 +50,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
 
 
 class _Look(NamedTuple):
-    """What one image gives: the encoded mask, its verdict, and the pixels of the prior's body."""
+    """Result for one image: the encoded mask, its verdict, and the number of pixels of the prior's body."""
 
     encoded: bytes
     verdict: MaskVerdict
@@ -64,7 +64,7 @@ def _look(capture: Capture, backend: Backend, prior_of: PriorOf, number: int) ->
 
 
 def _findings(capture: Capture, camera: str, verdicts: list[MaskVerdict], bodies_px: list[int]) -> dict[str, Any]:
-    """Return plain values: the median area, and the frames dropped or noted, each with its reason."""
+    """Return plain values: the median area, and the frames that are dropped or noted, each with its reason."""
     sudden = area_jumps(capture.frames, verdicts, bodies_px)
     judged = {
         frame: dataclasses.replace(verdict, fault=verdict.fault or sudden.get(frame))

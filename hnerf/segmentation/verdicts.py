@@ -7,17 +7,17 @@ import numpy as np
 from hnerf.capture.timing import median_step
 from hnerf.segmentation.prior import Prior
 
-MIN_AREA = 0.1  # of the prior's core; less is no person
+MIN_AREA = 0.1  # of the prior's core; a smaller mask shows no person
 MIN_COVERED = 0.5  # of the core
-MIN_WITHIN = 0.5  # of the mask, within where the person can be
+MIN_WITHIN = 0.5  # share of the mask that lies where the person can be
 MAX_AREA_RATIO = 1.3  # ratio of areas between neighbours in time
-NEIGHBOURS = 4  # nearest frames, at most so many median steps away, with whose median area a mask is compared
+NEIGHBOURS = 4  # a mask is compared with the median of this many nearest frames, at most this many median steps away
 
 
 @dataclass(frozen=True)
 class MaskVerdict:
-    """The result of checking one mask. fault: why the mask is dropped, or None; note: what is remarkable about it, or
-    None; area_px."""
+    """The result of checking one mask. fault: why the mask is dropped, or None; note: a remark about it, or None;
+    area_px."""
 
     fault: str | None
     note: str | None
@@ -44,8 +44,9 @@ def judge_mask(mask: np.ndarray, prior: Prior) -> MaskVerdict:
 def area_jumps(frames: tuple[int, ...], verdicts: list[MaskVerdict], expected_px: list[int]) -> dict[int, str]:
     """Return sudden changes of area that the prior does not explain, by frame.
 
-    A mask's area is compared with the median of its neighbours in time, and so is its ratio to what the prior covers
-    (`expected_px`, one a frame): a person who turns changes the first, a mask with a hole or a leak changes both.
+    A mask's area is compared with the median of its neighbours in time, and so is its ratio to the area of the prior
+    (`expected_px`, one per frame): a person who turns changes only the first, a mask with a hole or a leak changes
+    both.
     """
     found = {}
     area_px = np.array([v.area_px for v in verdicts], float)
