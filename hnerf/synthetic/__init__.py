@@ -1,4 +1,4 @@
-"""A synthetic capture with exact ground truth: a clothed person walks in a room before calibrated cameras."""
+"""A synthetic capture with exact ground truth: a clothed person walks in a room in front of calibrated cameras."""
 
 from hnerf.synthetic.write import write_synthetic_capture
 

@@ -10,7 +10,8 @@ FACE = (15, 16, 0)  # BODY_25: right eye, left eye, nose
 
 
 def person_colour(face_m: np.ndarray, rest_m: np.ndarray, depths_m: np.ndarray) -> np.ndarray:
-    """Return albedo (N, 3) at points of the naked rest body (N, 3), given how deep each lies in each garment (N, 5).
+    """Return albedo (N, 3) at points of the unclothed rest body (N, 3), given each point's depth in each garment (N,
+    5).
 
     face_m (3, 3): the rest body's keypoints FACE.
     """
@@ -88,11 +89,11 @@ def _ellipse(p: np.ndarray, centre: np.ndarray, radii_m: tuple[float, float]) ->
 
 
 def room_colour(origin_m: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what rays (N, 3) from inside the room see: lit colours (N, 3), and hit points (N, 3)."""
+    """Return lit colours (N, 3) and hit points (N, 3) of rays (N, 3) from inside the room."""
     low = np.array([-ROOM_HALF_SIDE_M, -ROOM_HALF_SIDE_M, 0.0])
     high = np.array([ROOM_HALF_SIDE_M, ROOM_HALF_SIDE_M, ROOM_HEIGHT_M])
     with np.errstate(divide="ignore"):
-        exits = np.abs((np.where(directions > 0, high, low) - origin_m) / directions)  # endless along a wall
+        exits = np.abs((np.where(directions > 0, high, low) - origin_m) / directions)  # infinite along a wall
     axis = exits.argmin(1)
     hit = origin_m + exits.min(1)[:, None] * directions
     level, colour = axis == 2, np.empty_like(hit)

@@ -1,4 +1,4 @@
-"""Simulated keypoint detections: noisy, unsure where the body hides them, and sometimes wrong."""
+"""Simulated keypoint detections: noisy, with low confidence where the body hides them, and sometimes wrong."""
 
 import numpy as np
 
@@ -7,8 +7,8 @@ from hnerf.geometry.rays import cast
 from hnerf.warp_import import wp
 
 NOISE_OF_WIDTH = 1.5 / 256  # 1.5 px in an image of 256: a detector's error scales with the person
-HIDDEN_NOISE = 3.0  # times as much where the body itself hides a keypoint
-HIDDEN_BEHIND_M = 0.20  # behind the surface; visible joints lie less deep under skin and cloth
+HIDDEN_NOISE = 3.0  # factor on the noise where the body itself hides a keypoint
+HIDDEN_BEHIND_M = 0.20  # behind the surface, from which it is hidden; visible joints lie less deep under skin and cloth
 OUTLIERS, OUTLIER_OF_WIDTH = 0.02, 0.16
 
 

@@ -1,7 +1,7 @@
-"""A body in a loose shirt, trousers, shoes and hair, all as one closed surface that the body model cannot express.
+"""A body with a loose shirt, trousers, shoes and hair, all as one closed surface that the body model cannot express.
 
 Clothes are grown from the rest body: their vertices are smoothed (which bridges armpits and creases), pushed out along
-smoothed normals, folded, and given smoothed skin weights, so that cloth does not move like skin.
+smoothed normals, folded, and given smoothed skinning weights, so that cloth does not move like skin.
 """
 
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ WAIST_ABOVE_HIPS_M = 0.12
 
 @dataclass(frozen=True)
 class DressedBody:
-    """A clothed rest body. rest_m (V, 3): the naked refined rest body, on which colours are painted. clothed_m (V, 3):
-    smoothed under cloth.
+    """A clothed rest body. rest_m (V, 3): the unclothed, refined rest body, on which colours are painted. clothed_m (V,
+    3): smoothed under cloth.
 
-    faces (F, 3); edges (E, 2): body vertices whose midpoints were added; weights (V, J): dense skin weights. depths_m
-    (V, 5): metres inside each garment's outline in the order of GARMENTS, negative outside; skin is 0, so that the
-    deepest garment is the visible one. outward (V, 3): smoothed normals. fold_phases (8,): where the folds lie.
+    faces (F, 3); edges (E, 2): body vertices whose midpoints were added; weights (V, J): dense skinning weights.
+    depths_m (V, 5): metres inside each garment's outline in the order of GARMENTS, negative outside; skin is 0, so that
+    the deepest garment is the visible one. outward (V, 3): smoothed normals. fold_phases (8,): where the folds lie.
     """
 
     rig: Rig
@@ -106,14 +106,13 @@ class DressedBody:
 
 
 def midpoints(per_vertex: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return values at the refined vertices from values at body vertices (V, ...): those, then the means of edges (E,
-    2)."""
+    """Return values at the refined vertices: those at body vertices (V, ...), then the means over edges (E, 2)."""
     return np.concatenate([per_vertex, per_vertex[edges].mean(1)])
 
 
 def _garment_depths(rig: Rig, rest_m: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return metres inside each garment's outline, (V, 5); see DressedBody. The rest pose is anny's: upright, arms a
-    little out."""
+    """Return metres inside each garment's outline, (V, 5); see DressedBody. The rest pose is anny's: upright, with arms
+    slightly outwards."""
     hips, neck, head = (_joint(rig, name) for name in ("upperleg01.L", "neck01", "head"))
     ankle_z = _joint(rig, "foot.L")[2]
     x, y, z = rest_m.T
@@ -147,12 +146,12 @@ def _smoothstep(x: np.ndarray) -> np.ndarray:
 
 
 def _edge(depth_m: np.ndarray) -> np.ndarray:
-    """Return 0 outside a garment and 1 from 12 mm inside its edge on: cloth ends in a ledge."""
+    """Return 0 outside a garment, rising to 1 at 12 mm inside its edge: cloth ends in a ledge."""
     return _smoothstep(depth_m / 0.012)
 
 
 def _averaging(faces: np.ndarray, count: int) -> sparse.csr_array:
-    """Return the matrix (V, V) that takes the mean of a vertex and its neighbours."""
+    """Return the matrix (V, V) that averages each vertex with its neighbours."""
     rows = np.concatenate([faces[:, [0, 1, 2]].ravel(), np.arange(count)])
     columns = np.concatenate([faces[:, [1, 2, 0]].ravel(), np.arange(count)])
     adjacency = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))

@@ -1,4 +1,4 @@
-"""Rendering by ray casting: a mesh lit by a dome of soft lights, in front of a room, and its shadow on the floor."""
+"""Rendering by ray casting: a mesh lit by a dome of soft lights in a room, and its shadow on the floor."""
 
 # mypy: disable-error-code="misc, no-untyped-def"
 
@@ -13,7 +13,7 @@ from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 from hnerf.synthetic.appearance import person_colour, room_colour
 from hnerf.warp_import import wp
 
-SUPERSAMPLES = 3  # per side; odd, so that one ray goes through the pixel's centre
+SUPERSAMPLES = 3  # per side of a pixel; odd, so that one ray goes through its centre
 KEY_DIRECTION = np.array([0.5, -0.6, 0.75])  # to the brightest part of the dome
 LIGHTS, BRIGHTNESS = 20, 1.25
 SHADOW_HALF_SIDE_M, SHADOW_CELLS = 1.6, 80
@@ -74,8 +74,8 @@ class Renderable(Protocol):
 
 @dataclass(frozen=True)
 class ShadedPerson:
-    """A posed, lit person. vertex_attributes (V, 9): what `person_colour` needs (3 rest_m, 5 depths_m), and the
-    arriving light."""
+    """A posed, lit person. vertex_attributes (V, 9): the inputs of `person_colour` (3 rest_m, 5 depths_m), and the
+    irradiance."""
 
     vertices_m: np.ndarray
     faces: np.ndarray
@@ -94,8 +94,8 @@ class ShadedPerson:
 
 
 def render_person(person: Renderable, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render a person over black, edge pixels weighted by coverage, (H, W, 3), with coverage (H, W), and whether the
-    centre ray hits, (H, W) bool."""
+    """Render a person on black; return the image (H, W, 3), with edge pixels weighted by coverage, the coverage (H, W),
+    and whether a pixel's centre ray hits, (H, W) bool."""
     rgb = np.zeros((camera.height_px, camera.width_px, 3))
     coverage, mask = np.zeros(rgb.shape[:2]), np.zeros(rgb.shape[:2], bool)
     seen_px, _ = camera.project(person.vertices_m)
@@ -115,7 +115,7 @@ def render_person(person: Renderable, camera: Camera) -> tuple[np.ndarray, np.nd
 
 
 def floor_shadow(mesh: wp.Mesh, centre_m: np.ndarray, lights: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the share of the floor's light that arrives around a point, on a grid (cells, cells) over x and y."""
+    """Return the share of its light that reaches the floor around a point, on a grid (cells, cells) over x and y."""
     line = np.linspace(-SHADOW_HALF_SIDE_M, SHADOW_HALF_SIDE_M, SHADOW_CELLS)
     x, y = np.meshgrid(line, line, indexing="ij")
     points = np.stack([x + centre_m[0], y + centre_m[1], np.full_like(x, 1e-3)], -1).reshape(-1, 3)

