@@ -25,9 +25,9 @@ def adjust(
     """Return the cameras with adjusted poses (those named in `free`) and focal lengths (those named in `focal`), fitted
     to keypoints (C, frames, K, 3). The pixel aspect ratio stays.
 
-    Where at least two other cameras are fixed, they alone triangulate the points, and every keypoint of a free camera
-    counts, however far off. Where all cameras are free, the adjusted rig is aligned to the given cameras by a
-    similarity transform, so that the world frame stays.
+    If at least two other cameras are fixed, they alone triangulate the points, and every keypoint of a free camera
+    counts, however far off. If all cameras are free, the adjusted rig is aligned to the given cameras by a similarity
+    transform, so that the world frame stays.
     """
     chosen = evenly_spaced(range(keypoints.shape[1]), MAX_FRAMES)
     flat = keypoints[:, chosen].reshape(len(cameras), -1, 3)
@@ -83,7 +83,8 @@ def _solve(
     used: np.ndarray,
     loss_scale_px: float,
 ) -> None:
-    """Add points (K, 3), seen where `used` (C, K) says, to a scene whose images are numbered from 1, and adjust it."""
+    """Add points (K, 3), seen where `used` (C, K) is True, to a scene whose images are numbered from 1, and adjust
+    it."""
     for k in np.flatnonzero(used.sum(0) >= 2):
         track = [pycolmap.TrackElement(int(c) + 1, int(k)) for c in np.flatnonzero(used[:, k])]
         scene.add_point3D(points_m[k], pycolmap.Track(track))
@@ -98,10 +99,10 @@ def adjust_shared_lens(
     cameras: Sequence[Camera], keypoints: np.ndarray, unknown: Sequence[str], distorted: bool
 ) -> tuple[list[Camera], float]:
     """Return the cameras with all poses adjusted and the focal lengths of those named in `unknown` multiplied by one
-    factor, and their one distortion term k1 (0 unless `distorted`). The rig is aligned to the given cameras.
+    factor, and their common distortion term k1 (0 unless `distorted`). The rig is aligned to the given cameras.
 
-    keypoints (C, frames, K, 3). Lenses of one make differ by a percent or two, which is less than a single camera can
-    tell from a step towards the person.
+    keypoints (C, frames, K, 3). Focal lengths of one lens model differ by a percent or two, too little for a single
+    camera to distinguish from a step towards the person.
     """
     chosen = evenly_spaced(range(keypoints.shape[1]), MAX_FRAMES)
     flat = keypoints[:, chosen].reshape(len(cameras), -1, 3)
@@ -168,8 +169,8 @@ def _solve_shared_lens(
 
 
 def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keypoints_px: np.ndarray) -> None:
-    """Add a camera with one focal length to the scene; y is scaled by the pixel aspect ratio fx / fy, and
-    skew is taken out."""
+    """Add a camera with one focal length to the scene; y is scaled by the pixel aspect ratio fx / fy, and skew is
+    removed."""
     aspect = np.array([1, camera.K[0, 0] / camera.K[1, 1]])
     fx, cx, cy = camera.K[0, 0], camera.K[0, 2], camera.K[1, 2] * aspect[1]
     size = {"width": camera.width_px, "height": camera.height_px}

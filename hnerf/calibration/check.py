@@ -1,4 +1,4 @@
-"""Check of the given cameras: errors that stop the run, measurements for the report, and refinement where needed."""
+"""Check of the given cameras: errors that stop the run, measurements for the report, and refinement if needed."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -106,8 +106,8 @@ def _rounded(camera: Camera) -> Camera:
 
 
 def _without(empty: list[str], capture: Capture, settings: CalibrationSettings) -> CalibrationReport:
-    """Return the report of the other cameras, with those that never show the person rejected. Raises InputError if
-    fewer than two are left."""
+    """Return the report of the other cameras, with the `empty` ones, which never show the person, rejected. Raises
+    InputError if fewer than two are left."""
     others = tuple(name for name in capture.train_cameras if name not in empty)
     if len(others) < 2:
         raise InputError(
@@ -125,8 +125,8 @@ def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np
     """Raise InputError if the whole rig follows another convention, its intrinsics are for another image size, or two
     cameras share a position.
 
-    Conventions are checked first, because the centres of an inverted ring of cameras coincide. In a wrong unit all
-    centres are close to each other, which is left to `_check_height`.
+    Conventions are checked first, because the centres of an inverted ring of cameras coincide. With a wrong unit, all
+    centres may be close to each other; `_check_height` reports that.
     """
     if found.cost_px > gross_limit_px(keypoints):
         off = f"{capture.name}: keypoints are off by {found.cost_px:.0f} px"
@@ -163,7 +163,7 @@ def _check_height(capture: Capture, found: Measure) -> None:
 
 
 def _height_notes(height_m: float) -> list[str]:
-    """Return a note on the person's height and, where it is unusual, on what to do if it is wrong."""
+    """Return a note on the person's height and, if it is unusual, on what to do if it is wrong."""
     low, high = COMMON_HEIGHT_M
     if np.isnan(height_m):
         return []
@@ -221,7 +221,7 @@ def _change_reasons(old: Camera, new: Camera) -> list[str]:
 
 
 def _judged(verdict: CameraVerdict, median_px: float, misfit: bool, limit_px: float) -> CameraVerdict:
-    """Return one training camera's verdict, which is worse where the residuals are still too large."""
+    """Return one training camera's verdict, downgraded if the residuals are still too large."""
     if median_px > limit_px:
         why = f"as used, median residual is still {median_px:.1f} px"
         verdict = dataclasses.replace(verdict, status="suspect", reasons=(*verdict.reasons, why))
@@ -239,7 +239,7 @@ def _unchecked(capture: Capture) -> CalibrationReport:
 
 
 def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
-    """Return the report of a single camera, where nothing can be triangulated. keypoints (frames, 25, 3)."""
+    """Return the report of a single camera, with which nothing can be triangulated. keypoints (frames, 25, 3)."""
     name = capture.train_cameras[0]
     shown = int((keypoints[..., 2] > 0).any(1).sum())
     notes = (
@@ -247,7 +247,7 @@ def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
         "not checked with one camera: reprojection, units, body height, direction of extrinsics, leave-one-out",
     )
     camera, raised = capture.cameras[name], ""
-    if capture.given_poses() is None:  # which are of the given camera
+    if capture.given_poses() is None:  # given poses belong to the given camera
         camera, raised = raised_above_ground(camera, keypoints, capture.up, capture.stature_m or USUAL_HEIGHT_M)
     reasons = size_reasons(capture, name) + intrinsics_reasons(camera)
     reasons += [raised] if raised else ground_reasons(camera, keypoints, capture.up, capture.stature_m)

@@ -10,21 +10,21 @@ from hnerf.capture.people import person_heights_px
 from hnerf.geometry.camera import Camera, resampling
 from hnerf.geometry.triangulation import confidence_of, reprojection_px, solve_points, triangulate
 
-TRIM = 0.8  # share of the residuals that count; the rest are taken for detector errors
+TRIM = 0.8  # share of the residuals that count; the rest are assumed to be detector errors
 BODY_HEIGHT_M = (0.5, 2.3)
 USUAL_HEIGHT_M = 1.7  # to advise on units, and to place a camera of unknown height; a body fit has a prior of its own
 UNITS_M = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres declared as millimetres": 1e3}
 GROSS_SHARE = 0.05  # of the person's height in the image: beyond this a calibration is wrong, not stale
 MISFIT_SHARE = 0.8  # a camera is a misfit if the trimmed cost without it falls below this share
-MISFIT_SHARE_OF_THREE = 0.6  # two cameras left agree more easily
+MISFIT_SHARE_OF_THREE = 0.6  # of three cameras: the two that are left agree more easily
 
-MIN_CROSSING_DEG = 10.0  # between lines of sight, below which a point's depth is in doubt
+MIN_CROSSING_DEG = 10.0  # between lines of sight, below which a point's depth is uncertain
 
 # BODY_25: ankle-knee, knee-hip, hips-neck and neck-nose make 0.87 of an adult's stature (Winter 2009, figure 4.1).
 LIMB_CHAIN = (((11, 10), (14, 13)), ((10, 9), (13, 12)), ((8, 1),), ((1, 0),))
 CHAIN_SHARE_OF_STATURE = 0.87
 
-MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # by the mistake: the function that undoes it
+MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # for each mistake, the function that undoes it
     "the extrinsics are camera to world (inverted)": lambda c: dataclasses.replace(c, R=c.R.T, t_m=-c.R.T @ c.t_m),
     "R is transposed": lambda c: dataclasses.replace(c, R=c.R.T),
     "T is the camera's centre": lambda c: dataclasses.replace(c, t_m=-c.R @ c.t_m),
@@ -32,14 +32,14 @@ MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # by the mistake: the funct
         c, R=np.diag([1, -1, -1]) @ c.R, t_m=np.diag([1, -1, -1]) @ c.t_m
     ),
 }
-# Made in all cameras, they would only scale the world.
+# In all cameras at once, these would only scale the world.
 SINGLE_CAMERA_MISTAKES: dict[str, Callable[[Camera], Camera]] = {
     f"T is in {unit}": lambda c, metres=metres: dataclasses.replace(c, t_m=metres * c.t_m)  # type: ignore[misc]
     for unit, metres in UNITS_M.items()
 }
 
 SIZE_RATIOS = np.geomspace(1 / 5, 5, 161)  # of image sizes, in steps of 2 %
-OTHER_SIZE = 1.2  # least factor either way: closer to 1, a refined K may be as good
+OTHER_SIZE = 1.2  # minimum factor in either direction: closer to 1, a refined K may be as good
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +69,7 @@ def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
     flat = keypoints.reshape(len(cameras), -1, 3)
     points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
     points_m = points_m.reshape(*keypoints.shape[1:3], 3)
-    off_px = max(float(np.hypot(*camera.size_px)) for camera in cameras)  # where no point is in front of the camera
+    off_px = max(float(np.hypot(*camera.size_px)) for camera in cameras)  # if no point is in front of the camera
     found = {camera.name: row[np.isfinite(row)] for camera, row in zip(cameras, residuals_px, strict=True)}
     return Measure(
         median_px={name: float(np.median(row)) if len(row) else off_px for name, row in found.items()},
@@ -127,10 +127,11 @@ def held_out_parts(keypoints: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarr
 
 
 def cost_without_each_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> dict[str, float]:
-    """Return the trimmed cost of the other cameras when one is left out, by the name of that one; needs three cameras.
+    """Return the trimmed cost of the other cameras when one is left out, by the left-out camera's name; needs three
+    cameras.
 
-    A point in n views leaves 2n - 3 degrees of freedom in 2n residuals; the costs are scaled to what all cameras would
-    show.
+    A point in n views leaves 2n - 3 degrees of freedom in 2n residuals; the costs are scaled to be comparable with that
+    of all cameras.
     """
     count = len(cameras)
     scale = np.sqrt((2 * count - 3) / (2 * count)) / np.sqrt((2 * count - 5) / (2 * count - 2))
@@ -152,7 +153,7 @@ def body_height_m(points_m: np.ndarray) -> float:
 
 
 def likely_unit(height: float) -> str | None:
-    """Return the unit in which a height that is impossible in metres would be a person's; None if there is none."""
+    """Return the unit in which a height that is impossible in metres would suit a person; None if there is none."""
     heights_m = {unit: height * metres for unit, metres in UNITS_M.items()}
     possible = [unit for unit, metres in heights_m.items() if BODY_HEIGHT_M[0] <= metres <= BODY_HEIGHT_M[1]]
     return min(possible, key=lambda unit: abs(np.log(heights_m[unit] / USUAL_HEIGHT_M)), default=None)
@@ -180,11 +181,11 @@ def convention_mistake(cameras: Sequence[Camera], keypoints: np.ndarray) -> str 
 
 
 def size_ratio(cameras: Sequence[Camera], keypoints: np.ndarray) -> float | None:
-    """Return the factor for all K, calibrated at another image size, that makes the calibration fit keypoints (C,
-    frames, 25, 3).
+    """Return the factor on all K that makes the calibration fit keypoints (C, frames, 25, 3), as if K was for another
+    image size.
 
-    None if the factor is close to 1, if none fits, or if a single camera may be to blame: with three or more cameras if
-    the others agree without it, with two cameras always.
+    None if the factor is close to 1, if none fits, or if a single camera may be the cause: with three or more cameras,
+    if the others agree without it; with two, always.
     """
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
     if len(cameras) < 3 or min(cost_without_each_px(cameras, flat).values()) <= limit_px:
@@ -197,7 +198,7 @@ def size_ratio(cameras: Sequence[Camera], keypoints: np.ndarray) -> float | None
 
 
 def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Camera], dict[str, str]]:
-    """Return the cameras with one camera's mistake undone, and that mistake by the camera's name, if this alone makes a
+    """Return the cameras with one camera's mistake undone, and that mistake by the camera's name, if that alone makes a
     grossly wrong camera fit keypoints (C, frames, 25, 3). Mistakes with the same effect are joined by "or"."""
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
     gross = np.flatnonzero(_medians_px(cameras, flat) > limit_px)

@@ -1,4 +1,4 @@
-"""Doubts about a recording that the person in it raises: the cameras may agree on a mistake that all of them share."""
+"""Checks of a recording against the person it shows: cameras may agree although all of them share a mistake."""
 
 import logging
 
@@ -13,15 +13,15 @@ from hnerf.geometry.camera import Camera
 
 log = logging.getLogger("hnerf.calibration")
 
-MIN_PERSON_PX = 4.0  # median height of a person at least; smaller, all keypoints are on one spot
+MIN_PERSON_PX = 4.0  # minimum of a person's median height; below it, all keypoints are on one spot
 MIN_UPRIGHT_COSINE = 0.5  # mean cosine between trunk and up; below it the person lies or bends, or `up` is wrong
-EXCHANGED_COSINE = -0.3  # median cosine between left as labelled, and left as face and feet show it
+EXCHANGED_COSINE = -0.3  # median cosine between left as labelled and as shown by face and feet, if sides are swapped
 LOOKED_AT = 5  # frames of each camera, evenly spaced, whose keypoints are compared with the person's pixels
 PLATE_DIFFERENCE = 30  # grey levels between image and clean plate that show the person
 GAIN = 0.25  # share of keypoints that undoing a mistake brings onto the person
-LOW_SHARE = 0.4  # of the other cameras' share; of a person who is hidden by half, more than that stays in the mask
-MAX_COVERED = 0.5  # of a picture, by a mask of the person; more is mostly an inverted one, which segmentation refuses
-MIN_IN_SIGHT = 0.05  # share of the person's keypoints in the pictures of a test camera
+LOW_SHARE = 0.4  # of the other cameras' share; a mask of a half-hidden person still holds more keypoints than that
+MAX_COVERED = 0.5  # of an image, by a person's mask; a larger mask is usually inverted, which segmentation refuses
+MIN_IN_SIGHT = 0.05  # share of the person's keypoints within the images of a test camera
 # BODY_25
 NOSE, NECK, MID_HIP, EARS = 0, 1, 8, (17, 18)
 LEFT, RIGHT = (5, 12), (2, 9)  # shoulder, hip
@@ -29,7 +29,7 @@ TOES, HEELS = (19, 22), (21, 24)
 
 
 def check_spread(capture: Capture, keypoints: np.ndarray) -> None:
-    """Raise InputError where all keypoints (C, frames, 25, 3) of a camera's person lie on one spot."""
+    """Raise InputError if all keypoints (C, frames, 25, 3) of a camera's person lie on one spot."""
     for name, found in zip(capture.train_cameras, keypoints, strict=True):
         heights_px = person_heights_px(found[(found[..., 2] > 0).any(1)])
         if len(heights_px) and np.median(heights_px) < MIN_PERSON_PX:
@@ -40,7 +40,7 @@ def check_spread(capture: Capture, keypoints: np.ndarray) -> None:
 
 
 def doubts(capture: Capture, keypoints: np.ndarray, points_m: np.ndarray | None) -> tuple[str, ...]:
-    """Return in words, and log, what contradicts the recording. keypoints (C, frames, 25, 3) of the training cameras;
+    """Return in words what contradicts the recording, and log it. keypoints (C, frames, 25, 3) of the training cameras;
     points_m (frames, 25, 3), None with one camera."""
     found = of_other_pictures(capture, keypoints)
     if points_m is not None:
@@ -97,9 +97,8 @@ def _direction(start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
 
 
 def of_test_cameras(capture: Capture, points_m: np.ndarray) -> list[str]:
-    """Return doubts about cameras for testing that do not see the person where the training cameras do, points_m
-    (frames, 25, 3): all scores would be wrong. Where a test camera has no keypoints, its picture must show some of
-    these points."""
+    """Return doubts about test cameras that do not see the person where the training cameras do, at points_m (frames,
+    25, 3): all scores would be wrong. If a test camera has no keypoints, its images must show some of these points."""
     lines = []
     for name in capture.test_cameras:
         camera, people = capture.cameras[name], capture.keypoints(name)
@@ -119,7 +118,8 @@ def of_test_cameras(capture: Capture, points_m: np.ndarray) -> list[str]:
 
 def _off_share(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> float:
     """Return the median distance in the image, as a share of the person's height, between points (frames, 25, 3) and
-    the nearest of the people (frames, P, 25, 3); NaN if nobody is seen. Points behind the camera are a height off."""
+    the nearest of the people (frames, P, 25, 3); NaN if nobody is seen. Points behind the camera count as one height
+    off."""
     uv, depth_m = camera.project(points_m)
     heights_px = person_heights_px(people)[..., None].clip(1)
     shares = np.linalg.norm(uv[:, None] - people[..., :2], axis=-1) / heights_px
@@ -131,7 +131,7 @@ def _off_share(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> floa
 
 
 def _in_sight(camera: Camera, points_m: np.ndarray) -> bool:
-    """Return whether some of the points (..., 3) that are known lie in the picture, and not all on one spot."""
+    """Return whether some of the known points (..., 3) lie in the image, and not all on one spot."""
     known_m = points_m[np.isfinite(points_m).all(-1)]
     uv, depth_m = camera.project(known_m)
     inside = camera.holds(uv) & (depth_m > 0)
@@ -142,10 +142,10 @@ def _in_sight(camera: Camera, points_m: np.ndarray) -> bool:
 
 def of_other_pictures(capture: Capture, keypoints: np.ndarray) -> list[str]:
     """Return doubts if keypoints (C, frames, 25, 3) lie on the person only when they are mirrored left to right, or if
-    a camera's were detected in other pictures than it has.
+    a camera's keypoints were detected in images other than its own.
 
-    A ring of cameras cannot tell: mirrored in all of them, a person stands turned about the ring's axis. The person's
-    pixels are those of masks that came with the recording or from a network, else what differs from a clean plate.
+    A ring of cameras cannot tell: mirrored in all of them, a person is merely turned about the ring's axis. The
+    person's pixels come from masks, either given or from a network, else from the difference to a clean plate.
     """
     rows = list(evenly_spaced(tuple(range(len(capture.frames))), LOOKED_AT))
     detected = dict(zip(capture.train_cameras, keypoints[:, rows], strict=True))
@@ -169,8 +169,8 @@ def of_other_pictures(capture: Capture, keypoints: np.ndarray) -> list[str]:
 
 
 def _worse(camera: str, shares: dict[str, float], undone: dict[str, float]) -> list[str]:
-    """Return a doubt if far fewer keypoints of a camera lie on the person than in other cameras, or once a mistake is
-    undone. shares: by camera; undone: by mistake."""
+    """Return a doubt if far fewer of a camera's keypoints lie on the person than in other cameras, or than with a
+    mistake undone. shares: by camera; undone: by mistake."""
     share, usual = shares[camera], float(np.median([shares[name] for name in shares if name != camera] or [0.0]))
     mistake = max(undone, key=lambda what: undone[what])
     if undone[mistake] > share + GAIN:
@@ -186,8 +186,8 @@ def _worse(camera: str, shares: dict[str, float], undone: dict[str, float]) -> l
 
 
 def _on(people: list[np.ndarray | None], keypoints: np.ndarray, mirrored: bool = False) -> np.ndarray:
-    """Return for each keypoint that is detected of (n, 25, 3) whether it lies on the person in as many pictures, (m,);
-    NaN outside the picture."""
+    """Return whether each detected keypoint of (n, 25, 3) lies on the person in the n images, (m,); NaN outside the
+    image."""
     hits = [np.zeros(0)]
     for person, points in zip(people, keypoints, strict=True):
         if person is not None:
@@ -199,14 +199,14 @@ def _on(people: list[np.ndarray | None], keypoints: np.ndarray, mirrored: bool =
 
 
 def _share(*hits: np.ndarray) -> float:
-    """Return the mean of what is known; 0 if nothing is."""
+    """Return the mean of the finite values; 0 if there are none."""
     known = np.concatenate([np.zeros(0), *hits])
     known = known[np.isfinite(known)]
     return float(known.mean()) if len(known) else 0.0
 
 
 def _person(capture: Capture, camera: str, frame: int) -> np.ndarray | None:
-    """Return which pixels show the person, (H, W) bool; None where nothing tells."""
+    """Return which pixels show the person, (H, W) bool; None if that is not known."""
     mask = capture.given_mask(camera, frame)
     if mask is not None:
         return mask if mask.mean() < MAX_COVERED else None

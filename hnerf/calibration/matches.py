@@ -13,7 +13,7 @@ from hnerf.geometry.camera import Camera
 from hnerf.pycolmap_import import pycolmap
 
 INLIER_PX = 3.0  # of the fundamental matrix that verifies matches
-MIN_MATCHES = 15  # and a share: a fundamental matrix fits some wrong matches by chance
+MIN_MATCHES = 15  # and the share MIN_INLIERS: a fundamental matrix fits some wrong matches by chance
 MIN_INLIERS = 0.3
 
 log = logging.getLogger("hnerf.calibration")
@@ -30,10 +30,10 @@ class Matches:
 
     @staticmethod
     def of(capture: Capture) -> "Matches":
-        """Match the training cameras' images of one frame. Cameras too far apart to match have no pair, which is no
-        fault.
+        """Match the training cameras' images of one frame. Cameras too far apart to match have no pair, which is not an
+        error.
 
-        A pair is verified by a fundamental matrix of its own, not by the calibration, which is what is being checked.
+        A pair is verified by a fundamental matrix of its own, not by the calibration, which is being checked.
         """
         names, frame = capture.train_cameras, capture.frames[len(capture.frames) // 2]
         log.info("SIFT in %d cameras", len(names))

@@ -8,9 +8,9 @@ from hnerf.capture.standing import is_standing, stature_on_ground_m
 from hnerf.geometry.camera import Camera
 
 FIELD_OF_VIEW_DEG = (10.0, 120.0)  # of the longer side; people are not filmed with lenses beyond this range
-PRINCIPAL_POINT_RANGE = 1 / 3  # of the image's sides, about the middle: an uncropped image's principal point is in it
+PRINCIPAL_POINT_RANGE = 1 / 3  # of the image's sides, about the centre: holds an uncropped image's principal point
 MAX_ASPECT_ERROR = 0.1  # of the pixel aspect ratio from 1
-UNMEASURED_M = 1e-6  # height of a camera whose height nobody has measured
+UNMEASURED_M = 1e-6  # a camera height below this means that it was not measured
 
 
 def intrinsics_reasons(camera: Camera) -> list[str]:
@@ -33,8 +33,8 @@ def intrinsics_reasons(camera: Camera) -> list[str]:
 
 
 def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str, stature_m: float | None) -> list[str]:
-    """Return, in words, whether world height 0 can be the ground under a person of this stature, None if not known,
-    seen as keypoints (frames, 25, 3)."""
+    """Return, in words, whether world height 0 can be the ground under a person of this stature (None: not known), seen
+    as keypoints (frames, 25, 3)."""
     measured_m = stature_on_ground_m(camera, keypoints, up)
     if np.isnan(measured_m):
         return [
@@ -51,15 +51,15 @@ def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str, stature_m: fl
 
 
 def raised_above_ground(camera: Camera, keypoints: np.ndarray, up: str, stature_m: float) -> tuple[Camera, str]:
-    """Return a camera that stands at height 0, where nobody has measured its height, raised until a person of
-    this stature, seen as keypoints (frames, 25, 3), stands on height 0; and what was done, in words. Any other camera
-    is returned as it is, with no words."""
+    """Return a camera at height 0, whose height was thus not measured, raised until a person of this stature, seen as
+    keypoints (frames, 25, 3), stands on height 0; and what was done, in words. Any other camera is returned unchanged,
+    with an empty text."""
     vertical = np.eye(3)["xyz".index(up)]
     if abs(camera.centre_m @ vertical) > UNMEASURED_M:
         return camera, ""
     by_a_metre = dataclasses.replace(camera, t_m=camera.t_m - camera.R @ vertical)
     height_m = stature_m / stature_on_ground_m(by_a_metre, keypoints, up)
-    if not 0 < height_m < np.inf:  # nor of a person who lies with the head towards the camera
+    if not 0 < height_m < np.inf:  # such as of a person who lies with the head towards the camera
         return camera, ""
     words = (
         f"its height is not known: {height_m:.2f} m if the camera is level and the person stands {stature_m:.2f} m tall"

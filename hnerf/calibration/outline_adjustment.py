@@ -1,7 +1,7 @@
 """Adjustment of cameras until the person's outlines in all cameras belong to one body.
 
-A detector sees hips and shoulders elsewhere from the front than from behind, alike in all frames, so cameras that
-keypoints have refined may be off by pixels. Outlines have no such bias, but say little of cameras that are far off.
+A detector places hips and shoulders differently from the front than from behind, in all frames alike, so cameras
+refined by keypoints may be off by pixels. Outlines have no such bias, but say little about cameras that are far off.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ FOCAL_STD, FOCAL_STEP = 0.2, 0.02  # of the logarithm of a focal length from key
 LOSS_SCALE_PX = 0.5  # of Cauchy's loss: errors of masks are larger
 EVALUATIONS = 20
 MIN_COST_DECREASE = 0.01  # as a share: a smaller step is the last
-MIN_GAIN_PX = 0.01  # of outlines at other instants; cameras from keypoints without bias leave 0.006 px on valid-wave
+MIN_GAIN_PX = 0.01  # on outlines at held-out instants; cameras from keypoints without bias leave 0.006 px on valid-wave
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -39,9 +39,10 @@ def follow_outlines(
     min_improvement: float,
     unknown_focal: Sequence[str] = (),
 ) -> tuple[list[Camera], str]:
-    """Return the cameras fitted to the outlines, if a fit to every other instant improves the rest by a share of
-    `min_improvement` or more; and by how much it does, in words, empty if the cameras are the given ones. points_m
-    (frames, 25, 3): the person's joints, NaN where unknown; unknown_focal: as of `adjust_to_outlines`."""
+    """Return the cameras fitted to the outlines if a fit to every second instant improves the cost of the other
+    instants by a share of `min_improvement` or more, else the given cameras; and the gain in words, empty for the given
+    cameras. points_m (frames, 25, 3): the person's joints, NaN where unknown; unknown_focal: as in
+    `adjust_to_outlines`."""
     if outlines is None or len(outlines.instants) < 2:
         return list(cameras), ""
     log.info("trying: fitted to outlines")
@@ -62,8 +63,8 @@ def adjust_to_outlines(
     person_m: np.ndarray,
     unknown_focal: Sequence[str] = (),
 ) -> list[Camera]:
-    """Return the cameras with poses of those named in `free` fitted to the outlines, and with one zoom of all those
-    named in `unknown_focal`; person_m (3,): where the person is, about which they turn. If all are free, the rig is
+    """Return the cameras fitted to the outlines: the poses of those named in `free`, and one common zoom of those named
+    in `unknown_focal`. person_m (3,): the person's position, about which cameras turn. If all are free, the rig is
     aligned to the given cameras."""
     zooms = 1 if unknown_focal else 0
     stds = np.array([*np.tile(STD, len(free)), *[FOCAL_STD] * zooms])
@@ -76,7 +77,7 @@ def adjust_to_outlines(
         changes = dict(zip(free, values[: 6 * len(free)].reshape(-1, 6), strict=True))
         return [_turned(c, changes[c.name], person_m) if c.name in changes else c for c in at_zoom]
 
-    @lru_cache(maxsize=1)  # slopes are asked for where the last residuals were
+    @lru_cache(maxsize=1)  # slopes are evaluated where the last residuals were
     def near_hull(*values: float) -> NearHull:
         return outlines.near_hull(moved(np.array(values)))
 
@@ -111,8 +112,8 @@ def adjust_to_outlines(
 
 
 def _zoomed_about(camera: Camera, zoom: float, pivot_m: np.ndarray) -> Camera:
-    """Return a camera with its focal length multiplied, moved along its axis so that a point of the world is seen at
-    the same pixel and of the same size."""
+    """Return a camera with its focal length multiplied, moved along its axis so that a point of the world keeps its
+    pixel and its size in the image."""
     back_m = (zoom - 1) * (camera.R @ pivot_m + camera.t_m)[2]
     return dataclasses.replace(zoomed(camera, zoom), t_m=camera.t_m + np.array([0, 0, back_m]))
 

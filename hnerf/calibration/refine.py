@@ -1,5 +1,4 @@
-"""Refinement of cameras, accepted only where held-out frames and joints prove it and the images do not contradict
-it."""
+"""Refinement of cameras, accepted only if held-out frames and joints prove it and the images do not contradict it."""
 
 import dataclasses
 import logging
@@ -18,8 +17,8 @@ from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.geometry.camera import Camera
 
-OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # by which share, or how many pixels, outlines may fit worse by chance
-MATCH_NOISE_PX = 0.5  # by which the matches of two cameras may fit worse by chance
+OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # share, or pixels, by which outlines may fit worse by chance
+MATCH_NOISE_PX = 0.5  # pixels by which the matches of two cameras may fit worse by chance
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -38,14 +37,14 @@ class Refinement:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Candidate cameras, what was changed by camera name, and their cost on held-out frames."""
+    """Candidate cameras, their changes by camera name, and their cost on held-out frames."""
 
     cameras: list[Camera]
     changes: dict[str, str]
     cost_px: float
 
     def also(self, change: str) -> "_Candidate":
-        """Return the candidate with one more change of all that was changed."""
+        """Return the candidate with one more change of every changed camera."""
         changes = {name: f"{before}; then {change}" for name, before in self.changes.items()}
         return dataclasses.replace(self, changes=changes)
 
@@ -111,7 +110,7 @@ def _refine_one_by_one(
             log.info("trying: %s", what)
             tried[name] = held_out_px[what] = held_out_cost_px(cameras, keypoints, (*changes, name), zoomed)
             kept[name] = f"pose kept: refining it takes held-out frames {_from_to(cost_px, tried[name])}"
-            if matches.by_pair and (  # else nothing could contradict
+            if matches.by_pair and (  # without matches, nothing could contradict
                 against := _contradiction(matches, cameras, adjust(cameras, keypoints, (*changes, name), zoomed))
             ):
                 kept[name] += f", but {against}"
@@ -158,8 +157,8 @@ def judge_by_outlines(
     """Return the cost of the person's outlines before and after, and why it rules out the refinement (empty if it does
     not).
 
-    Outlines may fit worse by chance, but by no larger share than keypoints gained: a detector that is wrong about a
-    joint in all frames alike moves a camera for a few hundredths of its residual.
+    Outlines may fit worse by chance, but by no larger share than keypoints gained: a detector that misplaces a joint in
+    the same way in all frames moves a camera to gain a few hundredths of its residual.
     """
     if outlines is None:
         return {}, ""
@@ -179,8 +178,8 @@ def _refine_for_size(
     must_beat_px: float,
     held_out_px: dict[str, float],
 ) -> tuple[list[Camera], list[str]]:
-    """Return intrinsics that explain a recorded image size other than the calibrated one without black bars, if
-    held-out frames prove them.
+    """Return the cameras, with intrinsics that explain a recorded size other than the calibrated one without black bars
+    if held-out frames prove them, and notes.
 
     Adds the costs of what was tried to `held_out_px`.
     """
@@ -202,8 +201,8 @@ def _refine_for_size(
 def held_out_cost_px(
     cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str], focal: Sequence[str] = ()
 ) -> float:
-    """Return the trimmed cost of keypoints (C, frames, 25, 3), each of `held_out_parts` judged with cameras adjusted to
-    the other."""
+    """Return the trimmed cost of keypoints (C, frames, 25, 3), where each of `held_out_parts` is judged with cameras
+    adjusted to the other."""
     costs = []
     for fitted, judged in held_out_parts(keypoints):
         adjusted = adjust(cameras, fitted, free, focal) if free else cameras

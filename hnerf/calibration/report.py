@@ -25,7 +25,7 @@ SEVERITY = ("ok", "refined", "suspect", "rejected")
 
 @dataclass(frozen=True)
 class CameraVerdict:
-    """Verdict on one camera. status: one of SEVERITY; residuals in pixels, None where none were measured, as with one
+    """Verdict on one camera. status: one of SEVERITY; residuals in pixels, None if none were measured, as with one
     camera; frame_offset: the corrected offset, the frame of this camera at the others' frame 0; timing: the offset as
     measured; reasons: in words."""
 
@@ -57,7 +57,7 @@ class CalibrationReport:
     cameras: those to use from here on, test cameras included; verdicts: of the training cameras; before, after,
     evidence: None with one training camera, or without keypoints; held_out_px, outlines_px: cost of each correction
     that was tried, on held-out frames and by the person's outlines; notes: about the whole rig, and checks that could
-    not be made; doubts: what in the recording contradicts it.
+    not be made; doubts: what in the recording contradicts the calibration.
     """
 
     cameras: dict[str, Camera]
@@ -130,7 +130,7 @@ def _rounded(tree: Any) -> Any:
     if isinstance(tree, list | tuple):
         return [_rounded(value) for value in tree]
     if isinstance(tree, float):
-        return round(tree, DECIMALS) + 0.0 if math.isfinite(tree) else None  # + 0.0: of -0.0
+        return round(tree, DECIMALS) + 0.0 if math.isfinite(tree) else None  # + 0.0 turns -0.0 into 0.0
     return tree
 
 

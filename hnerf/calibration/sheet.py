@@ -65,7 +65,7 @@ def _draw_outline(
     shown_px: Mapping[str, np.ndarray],
 ) -> None:
     """Draw points of the outline, coloured by how far their rays miss the visual hull of the other cameras, `shown_px`,
-    which is empty if no other camera has an outline then. every_px: of the outlines of all instants."""
+    which is empty if no other camera has an outline then. every_px: the same for all instants."""
     if outline is None or len(shown_px[name]) == 0:
         axes.set_title(f"{name}: no outline", fontsize=10)
         return

@@ -29,10 +29,10 @@ FRAMES = 8  # enough to tell that a camera is wrong
 PLATE_FRAMES = 24  # from which the background is estimated if there is no clean plate
 POINTS = 64  # on the outline in each image
 COARSE, FINE = 64, 17  # samples along a ray, and again between the neighbours of the best, twice
-SEARCH_RANGE = 1.5  # times the person's size: length of each ray that is searched, either way
-TRIM = 0.98  # share of the residuals that count; the rest are taken for mask errors
+SEARCH_RANGE = 1.5  # times the person's size: length of each ray that is searched, in either direction
+TRIM = 0.98  # share of the residuals that count; the rest are assumed to be mask errors
 MIN_KEYPOINTS_INSIDE = 0.6  # share of the person's keypoints; a mask that holds fewer is not the person's
-SLIGHT_CHANGE_PX = 5.0  # at most, of the distance of a ray from the hull, as a camera is changed slightly
+SLIGHT_CHANGE_PX = 5.0  # maximum change of a ray's distance from the hull when a camera is changed slightly
 BEHIND_CAMERA_PX = 1e4  # the residual of a point behind a camera that sees the person
 
 log = logging.getLogger("hnerf.calibration")
@@ -52,7 +52,7 @@ class MaskOutline:
     def around(mask: np.ndarray) -> "MaskOutline | None":
         """Return the outline of the largest component of a mask (H, W) bool with its holes filled; None if it is empty.
 
-        Where the image border cuts the person off there are no outline points.
+        There are no outline points where the image border cuts the person off.
         """
         parts, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         if not parts:
@@ -75,7 +75,7 @@ class MaskOutline:
 
 @dataclasses.dataclass(frozen=True)
 class Outlines:
-    """Outlines of the person by camera, one per instant; None where a camera has no mask then.
+    """Outlines of the person by camera, one per instant; None if a camera has no mask then.
 
     instants: their indices in `capture.frames`.
     """
@@ -85,7 +85,7 @@ class Outlines:
 
     @staticmethod
     def of(capture: Capture, frames: int = FRAMES) -> "Outlines | None":
-        """Return the outlines of the training cameras at as many frames, evenly spaced, from given masks, clean plates
+        """Return the outlines of the training cameras at this many evenly spaced frames, from given masks, clean plates
         or a median of the images.
 
         The masks use each camera's own keypoints only, so that a wrong calibration cannot spoil them. Returns None if
@@ -120,8 +120,8 @@ class Outlines:
         return self.near_hull(cameras).residuals_px()
 
     def near_hull(self, cameras: Sequence[Camera]) -> "NearHull":
-        """Return where the rays of each camera's outlines pass the hull of the others, at instants with at least
-        two."""
+        """Return where the rays of each camera's outlines pass the hull of the others, at instants with at least two
+        outlines."""
         known = [camera for camera in cameras if camera.name in self.by_camera]
         found: dict[str, list[_RaysNearHull]] = {camera.name: [] for camera in known}
         for instant in range(len(self.instants)):
@@ -147,9 +147,9 @@ class NearHull:
         return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in found.items()}
 
     def changes_px(self, replacements: Sequence[Sequence[Camera]]) -> np.ndarray:
-        """Return by how much all `residuals_px`, one camera's after another's, change if some cameras are replaced by
-        slightly different ones of the same names, for each of the replacements: (replacements, n). Only rays that end
-        near an outline are searched, and only where they pass the hull closest before."""
+        """Return the changes of all `residuals_px`, concatenated over cameras, for each replacement of some cameras by
+        slightly different ones of the same names: (replacements, n). Only rays that do not pass deep inside the hull
+        are searched, and only where they passed it closest before."""
         near_hull = [near for rows in self.by_camera.values() for near in rows]
         if not near_hull:
             return np.zeros((len(replacements), 0))
@@ -169,8 +169,8 @@ class _RaysNearHull:
     """Samples of the rays of one camera's outline, where they pass the hull of the other cameras closest.
 
     name: of the camera; seen: cameras and outlines of that instant, by name; along_m (n, FINE): distances of the
-    samples from the camera; points_m (n, FINE, 3): the samples; outside_px: what `_outside_px` says of them, by the
-    name of the other camera.
+    samples from the camera; points_m (n, FINE, 3): the samples; outside_px: the result of `_outside_px` for them, by
+    the name of the other camera.
     """
 
     name: str
@@ -209,8 +209,8 @@ class _RaysNearHull:
         return _RaysNearHull(name, seen, along_m, points_m, outside_px)
 
     def replaced(self, cameras: Sequence[Camera]) -> "_RaysNearHull":
-        """Return the samples with the cameras of these names replaced; if the rays change, their points closest to the
-        samples."""
+        """Return the samples with the cameras of these names replaced; if the rays change, the points on them closest
+        to the samples."""
         changed = {c.name: (c, self.seen[c.name][1]) for c in cameras if c.name in self.seen}
         seen = {**self.seen, **changed}
         if self.name in changed:
@@ -253,7 +253,7 @@ def _locate_person(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarr
 def _outside_px(camera: Camera, outline: MaskOutline, points_m: np.ndarray) -> np.ndarray:
     """Return how far points (n, S, 3) lie outside a mask, (n, S) pixels, negative inside.
 
-    Beyond the image border the nearest border pixel counts: where the border cuts the person off, the person may go on.
+    Beyond the image border the nearest border pixel counts: a person whom the border cuts off may continue there.
     """
     uv, depth_m = camera.project(points_m)
     at = np.fmin(np.fmax(uv, -BEHIND_CAMERA_PX), BEHIND_CAMERA_PX).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Image sizes: what an encoder may have done where the recorded size is not the calibrated one."""
+"""Image sizes: what an encoder may have done if the recorded size is not the calibrated one."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,7 +11,7 @@ SizeChange = Callable[[Camera, tuple[int, int], tuple[int, int]], Camera]
 
 
 def _crop_or_pad(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int], share: float) -> Camera:
-    """Return the camera of a cropped or padded picture, with this share of the size difference on the left and top."""
+    """Return the camera of a cropped or padded image, with this share of the size difference on the left and top."""
     per_recorded = camera.width_px / recorded_px[0]
     dx, dy = (share * per_recorded * (r - c) for r, c in zip(recorded_px, calibrated_px, strict=True))
     return dataclasses.replace(camera, K=resampling(1.0, 1.0, dx, dy) @ camera.K)
@@ -39,14 +39,14 @@ SIZE_CHANGES: dict[str, SizeChange] = {
 
 
 def size_unexplained(capture: Capture, name: str) -> bool:
-    """Return whether a camera recorded another size than it was calibrated at, and no black bars show what was done."""
+    """Return whether a camera's recorded size differs from the calibrated one, and no black bars show what was done."""
     other = capture.calibrated_sizes_px[name] != capture.recorded_sizes_px[name]
     return other and name not in capture.picture_areas_px
 
 
 def size_reasons(capture: Capture, name: str) -> list[str]:
-    """Return, in words, what is known about a recorded size other than the calibrated one; empty if they are the
-    same."""
+    """Return, in words, what is known about a recorded size that differs from the calibrated one; empty if they are
+    equal."""
     calibrated, recorded = capture.calibrated_sizes_px[name], capture.recorded_sizes_px[name]
     if calibrated == recorded:
         return []

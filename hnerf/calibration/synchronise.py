@@ -1,10 +1,10 @@
 """Synchronisation: the time offset of each camera against the others, to a fraction of a frame.
 
 The other cameras triangulate the keypoints; the camera's own keypoints of earlier and later frames are compared with
-their projections. What a small rotation or translation of the camera would explain is removed first, so that a stale
-pose is not taken for an offset. The mean square distance over whole-frame shifts is a parabola near its minimum: its
-vertex is the offset, its curvature says how well the motion determines it, and a jackknife over blocks of frames gives
-the standard error.
+their projections. The part that a small rotation or translation of the camera would explain is removed first, so that a
+stale pose is not mistaken for an offset. The mean square distance over whole-frame shifts is a parabola near its
+minimum: its vertex is the offset, its curvature shows how well the motion determines it, and a jackknife over blocks of
+frames gives the standard error.
 """
 
 import logging
@@ -21,17 +21,17 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
 
-MAX_STEPS = 10  # greatest shift tried either way, in steps between the capture's frames
-MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best shift and its two neighbours
+MAX_STEPS = 10  # largest shift tried in either direction, in steps between the capture's frames
+MIN_FRAMES = 8  # frames that a shifted camera must share with the others, at the best shift and its two neighbours
 JACKKNIFE_BLOCKS = 12  # of consecutive frames, each left out once
-SUSPECTED_SIGMAS, CERTAIN_SIGMAS = (2.0, 5.0)  # standard errors beyond which an offset counts
+SUSPECTED_SIGMAS, CERTAIN_SIGMAS = (2.0, 5.0)  # standard errors beyond which an offset is suspected, or certain
 MIN_OFFSET_FRAMES = 0.1  # smaller offsets are below the resolution of the parabola fit
 MAX_DISTANCE_FRAMES = 1.2  # between an instant and the recorded image that shows it
 MAX_ERROR_STEPS = 0.5  # standard error; beyond it an offset is not observable
 MIN_CURVATURE_SIGMAS = 2.0  # standard errors by which the curvature must exceed 0
 IRLS_ROUNDS = 5  # of iteratively re-weighted least squares
 OUTLIER_SCALES = 3.0  # times the scale of the residuals
-MIN_SCALE_PX = 0.5  # of the residuals; no detector is more exact
+MIN_SCALE_PX = 0.5  # of the residuals; no detector is more accurate
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -56,13 +56,14 @@ class Timing:
 
     @property
     def suspected(self) -> bool:
-        """Return whether the camera may be out of step."""
+        """Return whether the camera may be out of sync."""
         return abs(self.offset_frames) > max(MIN_OFFSET_FRAMES, SUSPECTED_SIGMAS * self.error_frames)
 
     @property
     def certain(self) -> bool:
-        """Return whether the camera is out of step: the offset is far beyond its error, and each half of the frames
-        gains by the other half's offset (a parabola is lower at x than at 0 if x lies between 0 and twice its vertex).
+        """Return whether the camera is certainly out of sync: the offset is far beyond its error, and each half of the
+        frames gains by the other half's offset (a parabola is lower at x than at 0 if x lies between 0 and twice its
+        vertex).
         """
         a, b = self.half_offsets
         agree = a * b > 0 and abs(a) < 2 * abs(b) < 4 * abs(a)
@@ -73,7 +74,7 @@ class Timing:
 @dataclass(frozen=True)
 class _View:
     """One camera's keypoints (F, 25, 3) and the other cameras' prediction of them: predicted_px (F, 25, 2), NaN where
-    they cannot triangulate, and its derivative by the camera's pose, pose_jacobian (F, 25, 2, 6)."""
+    they cannot triangulate, and its derivative with respect to the camera's pose, pose_jacobian (F, 25, 2, 6)."""
 
     frames: Sequence[int]
     keypoints: np.ndarray
@@ -122,7 +123,7 @@ def synchronise_capture(
     notes.
 
     Raises InputError, saying what to cut, if more than half of the frames would be lost or would show images more than
-    a frame away: the ingested images then lack the instants that the offsets ask for.
+    a frame away: the ingested images then lack the instants that the offsets require.
     """
     offsets, held_out_px, notes = synchronise(cameras, keypoints, capture.frames, settings)
     if not offsets:
@@ -160,10 +161,10 @@ def _cut_advice(cameras: Sequence[str], offsets: dict[str, float]) -> str:
 def synchronise(
     cameras: Sequence[Camera], keypoints: np.ndarray, frames: Sequence[int], settings: CalibrationSettings
 ) -> tuple[dict[str, float], dict[str, float], list[str]]:
-    """Return the offsets in frames of the cameras out of step, the held-out costs of everything tried, and notes.
+    """Return the offsets in frames of unsynchronised cameras, the held-out costs of everything tried, and notes.
 
-    Cameras are taken one after the other, first the one whose shift improves agreement most; a shift is accepted only
-    if its offset is certain and held-out frames improve. keypoints (C, frames, 25, 3).
+    Cameras are shifted one by one, first the one whose shift improves agreement most; a shift is accepted only if its
+    offset is certain and held-out frames improve. keypoints (C, frames, 25, 3).
     """
     offsets: dict[str, float] = {}
     held_out_px: dict[str, float] = {}
@@ -191,7 +192,7 @@ def synchronise(
             doubt = f"camera {best} may be out of step, but its offset is not certain: no camera is shifted"
             return {}, held_out_px, [doubt]
         offsets[best] = offsets.get(best, 0.0) + found[best].offset_frames
-    for name in offsets:  # measured while others were still out of step
+    for name in offsets:  # each was measured while others were still out of sync
         timing = measure_timing(cameras, _shift_keypoints(cameras, keypoints, frames, offsets), frames)[name]
         offsets[name] += 0.0 if timing.reason else timing.offset_frames
     return _relative_to_least_shifted(offsets, len(cameras)), held_out_px, []
@@ -228,8 +229,8 @@ def _halves_cost_px(cameras: Sequence[Camera], keypoints: Sequence[np.ndarray]) 
 
 
 def _timing(view: _View) -> Timing:
-    """Return the time offset of one camera; its error is by the jackknife over blocks of frames (Efron and Tibshirani
-    1993, chapter 11)."""
+    """Return the time offset of one camera; its error comes from the jackknife over blocks of frames (Efron and
+    Tibshirani 1993, chapter 11)."""
     every = np.arange(len(view.frames))
     halves = np.array_split(every, 2)
     costs = _cost_by_step(view, [every, *halves])
@@ -274,8 +275,8 @@ def _view(cameras: Sequence[Camera], keypoints: np.ndarray, index: int, frames: 
 
 
 def _pose_jacobian(camera: Camera, points_m: np.ndarray) -> np.ndarray:
-    """Return the derivatives (K, 2, 6) of the pixels of points (K, 3) by a small rotation and translation in the camera
-    frame: x' = x + w cross x + t, and the pinhole projection (Hartley and Zisserman, appendix 6)."""
+    """Return the derivatives (K, 2, 6) of the pixels of points (K, 3) with respect to a small rotation and translation
+    in the camera frame: x' = x + w cross x + t, and the pinhole projection (Hartley and Zisserman, appendix 6)."""
     x, y, z = np.moveaxis(points_m @ camera.R.T + camera.t_m, -1, 0)
     zero = np.zeros_like(z)
     by_move = np.stack([np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], -2)

@@ -9,7 +9,7 @@ NEARBY_PX = 1.0  # standard deviation of the neighbourhood from which unmixed co
 BLUR_PX = 0.5  # of evidence along the edge
 REGULARISATION = 100.0  # squared grey levels between the two colours at which the evidence weighs as much as the mask
 BESIDE_PX = 3.0  # from the edge, up to which pixels count as just outside the mask
-MAX_DEVIATION = 0.1  # median, of log ratios to the plate there: below 0.03 for good masks, above 0.15 for too small ones
+MAX_DEVIATION = 0.1  # median of log ratios to the plate there: below 0.03 for good masks, above 0.15 for too small ones
 LOG_OFFSET = 8.0  # grey levels added before the logarithm
 # Luma, and chroma twice: the person's own shading changes brightness rather than colour.
 COLOUR = np.array([[0.299, 0.587, 0.114], [-0.338, -0.662, 1.0], [1.0, -0.838, -0.162]], np.float32)

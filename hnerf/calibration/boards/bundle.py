@@ -80,7 +80,7 @@ class Adjustment:
         self.cameras, self.corners_m, self.corners_px, self.boards = cameras, corners_m, corners_px, boards
         self.moving, self.frame_step = np.asarray(moving), frame_step
         self.seen = np.isfinite(corners_px[..., 0])  # (C, F, N)
-        self.camera, self.frame = np.nonzero(self.seen.any(-1))  # of each picture
+        self.camera, self.frame = np.nonzero(self.seen.any(-1))  # of each image
         self.picture, self.corner = np.nonzero(self.seen[self.camera, self.frame])  # of each observation
         self.observed_px = corners_px[self.camera, self.frame][self.picture, self.corner]
         self.K = np.stack([camera.K for camera in cameras])
@@ -177,7 +177,7 @@ class Adjustment:
 
 
 def _adjacent_frames(seen: np.ndarray, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frame before and the frame after each one; the frame itself where that one is missing, or further away
+    """Return the frame before and the frame after each one; the frame itself if that one is missing, or further away
     than neighbours usually are. seen: (F,) bool."""
     own = np.arange(len(seen))
     before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(seen) - 1)

@@ -1,4 +1,4 @@
-"""Calibration from footage of a board, and the evidence of such footage about given cameras."""
+"""Calibration from footage of a board, and what such footage says about given cameras."""
 
 import dataclasses
 import json
@@ -67,8 +67,8 @@ class BoardCalibration:
 def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> BoardCalibration:
     """Calibrate the cameras from the board footage in a folder's `calibration/`.
 
-    Intrinsics come from calibration/intrinsic/ where it fixes them, else from the folder's calibration files, or, for a
-    camera with neither, from calibration/extrinsic/. The world is the first camera, or the board as it lies in frame
+    Intrinsics come from calibration/intrinsic/ if it determines them, else from the folder's calibration files, or, for
+    a camera with neither, from calibration/extrinsic/. The world is the first camera, or the board as it lies in frame
     `ground_frame` (Z up, origin at its top left corner). Raises InputError if the footage lacks what is needed.
     """
     footage = read_board_footage(folder, "extrinsic", ground_frame)
@@ -125,11 +125,12 @@ def board_evidence(capture: Capture) -> dict[str, Any] | None:
 
 
 def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two masks (C, F) bool: where a camera must see the board, and where the board was found with enough
-    corners to fix its pose.
+    """Return two masks (C, F) bool: where a camera should see the board, and where the board was found with enough
+    corners to determine its pose.
 
-    Visible: another camera found it and, placed as the fit has it, at least MIN_CORNERS corners fall into this camera's
-    image and the board faces it within MAX_TILT_DEG. Occlusion is not known, so occluded images count as visible.
+    Visible: another camera found the board and, at its fitted pose, at least MIN_CORNERS corners fall into this
+    camera's image and the board faces it within MAX_TILT_DEG. Occlusion is not known, so occluded boards count as
+    visible.
     """
     found = np.isfinite(fit.residuals_px[..., 0]).sum(-1) >= rig.MIN_CORNERS
     corners = np.einsum("fij,nj->fni", fit.boards.R, corners_m) + fit.boards.t_m[:, None]
@@ -145,8 +146,8 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
 
 
 def _check_board_found(footage: BoardFootage) -> None:
-    """Raise InputError if no camera sees enough of the board to be linked: the footage probably shows another board
-    than described."""
+    """Raise InputError if no camera sees enough of the board to be linked: the footage probably shows a board other
+    than the described one."""
     corners_px = np.stack(list(footage.corners_px.values()))
     found = rig.fixes_pose(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
     if found.sum(1).max() < rig.MIN_SHARED:
@@ -184,7 +185,8 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
 
 
 def _given_lenses(folder: Path) -> dict[str, Lens]:
-    """Return the lenses of the calibration file in a folder, which need not know poses; none where there is none."""
+    """Return the lenses of the calibration file in a folder, which need not contain poses; none if there is no such
+    file."""
     for name in INTRINSICS:
         path = path_in_capture(folder, name)
         if path.exists():
@@ -227,5 +229,5 @@ def _figures(fit: BoardFit, camera: int) -> dict[str, Any]:
 
 
 def rms(error_px: np.ndarray) -> float | None:
-    """Return the root of the mean square; None of nothing."""
+    """Return the root mean square; None if there are no errors."""
     return float(np.sqrt((error_px**2).mean())) if len(error_px) else None

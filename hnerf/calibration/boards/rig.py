@@ -12,10 +12,10 @@ from hnerf.calibration.boards.bundle import Adjustment, BoardFit, Poses
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MIN_CORNERS = 6  # that an image must show to be used: 12 numbers for the pose of a plane
+MIN_CORNERS = 6  # that an image must show to be used: they give 12 numbers for the pose of a plane
 FLATNESS_PX = 1.0  # by which a corner may be off the plane of the others in its image
 MIN_SHARED = 3  # frames in which two cameras must both see the board
-FAR_PX = 100.0  # cap of a corner's error, so that a camera far off does not decide where the board is
+FAR_PX = 100.0  # cap of a corner's error, so that a camera that is far off does not determine the board's pose
 
 Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3), t_m (3,)
 Views = dict[tuple[int, int], Pose]  # camera from board, by (camera, frame)
@@ -61,7 +61,7 @@ def solve_rig(
     frame_step: int = 1,
     frames: Sequence[int] | None = None,
 ) -> BoardFit:
-    """Solve for the poses of cameras with known intrinsics; the first camera is the world.
+    """Solve for the poses of cameras with known intrinsics; the first camera defines the world.
 
     corners_m (N, 3); corners_px (C, F, N, 2) undistorted, NaN where not seen, of `planar_corners`, in every
     `frame_step`-th frame of the footage; frames (F,): their numbers, if known. Raises InputError if the board does not
@@ -119,8 +119,8 @@ def _view_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np
 
 
 def _chain_poses(cameras: Sequence[Camera], views: Views) -> list[Camera]:
-    """Return camera poses chained over the spanning tree of the pairs that share most frames; the first camera is the
-    world."""
+    """Return camera poses chained over the spanning tree of the pairs that share most frames; the first camera defines
+    the world."""
     count = len(cameras)
     shared = {(i, j): [f for (k, f) in views if k == i and (j, f) in views] for i, j in combinations(range(count), 2)}
     cost = np.zeros((count, count))
@@ -148,7 +148,7 @@ def _robust_pose(steps: list[Pose]) -> Pose:
 
 
 def _board_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, views: Views) -> Poses:
-    """Return the board pose in the world for each frame: of the poses seen by single cameras, the one that fits all
+    """Return the board pose in the world for each frame: of the poses that single cameras give, the one that fits all
     cameras best."""
     frames = corners_px.shape[1]
     R, t_m, best_px = np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), np.full(frames, np.inf)
@@ -164,6 +164,6 @@ def _board_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: n
 
 
 def _relative_pose(a: Pose, b: Pose) -> Pose:
-    """Return b from a, where both are given from a third frame."""
+    """Return the transform b from a, given both from a third frame."""
     R = b[0] @ a[0].T
     return R, b[1] - R @ a[1]

@@ -14,15 +14,15 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 ROUNDS = 10  # of iteratively re-weighted least squares over pairs
-LEAST_ERROR_S = 5e-4  # of a pair, below which its weight does not rise
-CONTRADICTION = 4.0  # standard errors, from which pairs count less
+LEAST_ERROR_S = 5e-4  # of a pair: smaller errors do not raise its weight
+CONTRADICTION = 4.0  # standard errors beyond which a pair counts less
 
 log = logging.getLogger("hnerf.calibration")
 
 
 class Clocks(NamedTuple):
     """Clocks by camera, the first camera's being the common one. error_s: standard error of each, in the middle of what
-    it recorded together with others; pairs: what was measured; refused: why a pair was not."""
+    it recorded together with others; pairs: the measured ones; refused: why a pair could not be measured."""
 
     clocks: dict[str, Clock]
     error_s: dict[str, float]
@@ -37,9 +37,8 @@ def estimate_clocks(
 ) -> Clocks:
     """Return the clocks of the cameras from the subject's keypoints.
 
-    cameras: where they are calibrated, in the pixels of the keypoints. near_s: offsets of pairs that are known to half
-    a second, from the sound. Raises InputError naming a camera that never shows the person, or that no pair links
-    to the first.
+    cameras: if they are calibrated, in the pixels of the keypoints. near_s: offsets of pairs known to half a second,
+    from sound. Raises InputError naming a camera that never shows the person, or that no pair links to the first.
     """
     names = list(tracks)
     if len(names) < 2:

@@ -1,4 +1,4 @@
-"""Start offset and drift of one camera's clock against another's, from one person's keypoints and nothing else.
+"""Start offset and drift of one camera's clock against another's, from one person's keypoints alone.
 
 At the right offset one fundamental matrix explains all frames of two cameras (Albl et al. 2017, On the Two-view
 Geometry of Unsynchronized Cameras). The sums that it needs are cross-correlations of the monomials of the keypoints, so
@@ -12,20 +12,21 @@ import numpy as np
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 
-MIN_OVERLAP_S, MIN_OVERLAP = 1.0, 0.25  # that two recordings share: seconds, and of the shorter one
+MIN_OVERLAP_S, MIN_OVERLAP = 1.0, 0.25  # that two recordings must share: in seconds, and as a share of the shorter one
 CANDIDATES = 8  # offsets of lowest cost that are refined, each the best within SEPARATION_S
 SEPARATION_S = 0.2
 ROUNDS = 25  # of refinement
-MAX_STEP_S = 0.1  # that the offset changes by in a round
-CLEAR = 0.8  # of the next best offset's residual, which the best may have at most
-OTHER_S = 0.5  # from which another offset is another one
-DRIFT_SIGMAS, MAX_DRIFT_ERROR = 4.0, 1e-4  # standard errors by which a drift must show, and how well it must be known
-REACH_S, MIN_REACH = 0.1, 2  # seconds, and frames, on each side, through which a parabola is laid
-# Quantile of residuals by which offsets are compared: a wave of one hand tells steps of an even walk apart.
+MAX_STEP_S = 0.1  # maximum change of the offset in a round
+CLEAR = 0.8  # maximum residual of the best offset, as a share of the next best one's
+OTHER_S = 0.5  # difference beyond which two offsets are different solutions
+DRIFT_SIGMAS, MAX_DRIFT_ERROR = 4.0, 1e-4  # standard errors that a drift must exceed, and its maximum standard error
+REACH_S, MIN_REACH = 0.1, 2  # seconds, and frames, on each side, to which a parabola is fitted
+# Quantile of residuals by which offsets are compared. With a high one, a wave of one hand is enough to tell the steps
+# of an even walk apart.
 JUDGED = 0.95
-MIN_KEYPOINTS = 100  # that both see
-MAX_REFINED = 2000  # frames, evenly spaced, to which a clock is refined
-CONVERGED = 1e-7  # seconds, and drift: a step that ends the refinement
+MIN_KEYPOINTS = 100  # that both cameras must see
+MAX_REFINED = 2000  # evenly spaced frames to which a clock is refined
+CONVERGED = 1e-7  # seconds, and drift: a smaller step ends the refinement
 
 
 class Track(NamedTuple):
@@ -36,9 +37,9 @@ class Track(NamedTuple):
 
 
 class PairClock(NamedTuple):
-    """The clock of camera b by that of camera a: t_b = rate t_a + offset_s. middle_s: the middle of what both recorded,
-    by a's clock; error_s: standard error of t_b there; rate_error: of the rate, at most MAX_DRIFT_ERROR; clear: the
-    residual as a share of that of the next best offset."""
+    """The clock of camera b as a function of camera a's: t_b = rate t_a + offset_s. middle_s: the middle of what both
+    recorded, on a's clock; error_s: standard error of t_b there; rate_error: of the rate, at most MAX_DRIFT_ERROR;
+    clear: the residual as a share of that of the next best offset."""
 
     offset_s: float
     rate: float
@@ -48,14 +49,14 @@ class PairClock(NamedTuple):
     clear: float
 
     def offset_at(self, rate: float) -> float:
-        """Return the offset that puts both clocks in step in the middle of what both recorded, should b's rate be
-        another: other pairs may tell it better."""
+        """Return the offset that synchronises both clocks in the middle of what both recorded if b's rate is `rate`,
+        which other pairs may determine better."""
         return self.offset_s + (self.rate - rate) * self.middle_s
 
 
 class _Path(NamedTuple):
-    """A smoothed track: times_s (n,); moments (3, n, 25, 2), the places, velocities and accelerations a second;
-    known (n, 25); to_unit (3, 3), which takes homogeneous pixels to places of mean 0 and standard deviation 1."""
+    """A smoothed track: times_s (n,); moments (3, n, 25, 2), the positions, velocities per second and accelerations;
+    known (n, 25); to_unit (3, 3), which maps homogeneous pixels to positions of mean 0 and standard deviation 1."""
 
     times_s: np.ndarray
     moments: np.ndarray
@@ -69,11 +70,11 @@ class _Path(NamedTuple):
 
     @property
     def window_s(self) -> float:
-        """Return the time of the frames that are smoothed together, and whose detections are off together."""
+        """Return the duration of the frames that are smoothed together, whose errors are therefore correlated."""
         return (2 * _reach(self.step_s) + 1) * self.step_s
 
     def at(self, instants_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return places (m, 25, 2) and velocities (m, 25, 2) at instants on this clock, by Taylor's series from the
+        """Return positions (m, 25, 2) and velocities (m, 25, 2) at instants on this clock, by Taylor expansion from the
         nearest frame, and which are known (m, 25)."""
         after = np.searchsorted(self.times_s, instants_s).clip(1, len(self.times_s) - 1)
         row = after - (instants_s - self.times_s[after - 1] < self.times_s[after] - instants_s)
@@ -85,7 +86,7 @@ class _Path(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """A refined clock. middle_s: the middle of what both recorded, by the first clock; covariance (2, 2): of the offset
+    """A refined clock. middle_s: the middle of what both recorded, on the first clock; covariance (2, 2): of the offset
     there, and of the rate."""
 
     offset_s: float
@@ -96,11 +97,11 @@ class _Fit(NamedTuple):
 
 
 def smoothed(track: Track) -> _Path:
-    """Return a track as parabolas through the frames around each frame (local regression, Cleveland 1979), in units of
-    the spread of its places (Hartley 1997).
+    """Fit a parabola to the frames around each frame of a track (local regression, Cleveland 1979), in units of the
+    spread of its positions (Hartley 1997).
 
-    Between frames a detector's noise would otherwise average out, and offsets of half a frame would seem to fit best;
-    and differences of noisy places are no velocities. Raises InputError where nobody is seen.
+    Without smoothing, a detector's noise would average out between frames, so that offsets of half a frame would seem
+    to fit best; and differences of noisy positions would not be usable velocities. Raises InputError if nobody is seen.
     """
     xy, seen = track.keypoints[..., :2], track.keypoints[..., 2] > 0
     if len(track.times_s) < 3 or not seen.any():
@@ -124,16 +125,16 @@ def smoothed(track: Track) -> _Path:
 
 
 def _reach(step_s: float) -> int:
-    """Return through how many frames on each side a parabola is laid."""
+    """Return the number of frames on each side to which a parabola is fitted."""
     return max(MIN_REACH, round(REACH_S / step_s))
 
 
 def pair_clock(a: _Path, b: _Path, fundamental: np.ndarray | None = None, near_s: float | None = None) -> PairClock:
-    """Return how b's clock runs against a's, both of `smoothed`.
+    """Return b's clock as a function of a's; both paths are from `smoothed`.
 
-    fundamental: F (3, 3) with x_b^T F x_a = 0 in pixels, where the cameras are calibrated; it is found with the offset
-    otherwise. near_s: an offset that is known to half a second, from the sound. Raises InputError where the recordings
-    do not share enough keypoints, or no offset is clearly better than all others.
+    fundamental: F (3, 3) with x_b^T F x_a = 0 in pixels, if the cameras are calibrated; otherwise it is estimated with
+    the offset. near_s: an offset known to half a second, from sound. Raises InputError if the recordings do not share
+    enough keypoints, or no offset is clearly better than all others.
     """
     f = None if fundamental is None else _unit_fundamental(fundamental, a, b)
     offsets_s = _best_offsets(a, b, f) if near_s is None else np.array([near_s])
@@ -156,12 +157,12 @@ def pair_clock(a: _Path, b: _Path, fundamental: np.ndarray | None = None, near_s
     error = np.sqrt(drifting.covariance.diagonal())
     if error[1] < MAX_DRIFT_ERROR and abs(drifting.rate - 1) > DRIFT_SIGMAS * error[1]:
         return PairClock(*drifting[:3], float(error[0]), float(error[1]), clear)
-    rate_error = min(float(error[1]), MAX_DRIFT_ERROR)  # unknown is not none: other pairs may tell
+    rate_error = min(float(error[1]), MAX_DRIFT_ERROR)  # an unknown drift is not zero: other pairs may determine it
     return PairClock(*best[:3], float(np.sqrt(best.covariance[0, 0])), rate_error, clear)
 
 
 def _unit_fundamental(fundamental: np.ndarray, a: _Path, b: _Path) -> np.ndarray:
-    """Return F of pixels as the vector (9,) of norm 1 of F between the unit places of two paths."""
+    """Return F of pixels converted to normalised positions (`to_unit`) of two paths, as a vector (9,) of norm 1."""
     F = np.linalg.inv(b.to_unit).T @ fundamental @ np.linalg.inv(a.to_unit)
     return np.asarray(F.ravel() / np.linalg.norm(F))
 
@@ -186,7 +187,7 @@ def _best_offsets(a: _Path, b: _Path, f: np.ndarray | None) -> np.ndarray:
 
 
 def _monomials(path: _Path, instants_s: np.ndarray) -> np.ndarray:
-    """Return x x^T of the homogeneous places x on a grid of instants, (3, 3, 25, m), 0 where not known."""
+    """Return x x^T of the homogeneous positions x on a grid of instants, (3, 3, 25, m), 0 where not known."""
     places, _, known = path.at(instants_s)
     x = np.concatenate([places, np.ones_like(places[..., :1])], -1) * known[..., None]
     return np.einsum("mji,mjk->ikjm", x, x)
@@ -244,7 +245,7 @@ def _refined(a: _Path, b: _Path, offset_s: float, fixed: np.ndarray | None, drif
         clock_columns = np.column_stack([by_time, by_time * t])[:, : 1 + drifts]
         J = np.hstack([clock_columns, A] if fixed is None else [clock_columns]) / gradient[:, None]
         normal, ahead = (J * weights[:, None]).T @ J, (J * weights[:, None]).T @ residuals
-        if fixed is None:  # the norm of F is free: it stays as it is
+        if fixed is None:  # the norm of F is free: it is kept
             normal[1 + drifts :, 1 + drifts :] += np.outer(f, f) * normal.trace()
         step = -np.linalg.lstsq(normal, ahead, rcond=None)[0]
         if np.abs(step[: 1 + drifts]).max() < CONVERGED:
@@ -261,5 +262,6 @@ def _refined(a: _Path, b: _Path, offset_s: float, fixed: np.ndarray | None, drif
 
 
 def _off_together(a: _Path, b: _Path, frames: int) -> float:
-    """Return how many of a's frames, of which so many are used, evenly spaced, one smoothed detection is in."""
+    """Return how many of a's used frames, evenly spaced, fall within one smoothing window. frames: number of used
+    frames."""
     return max(1.0, max(a.window_s, b.window_s) / (a.step_s * len(a.times_s) / frames))

@@ -21,14 +21,15 @@ from hnerf.detection.detect import with_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MAX_FRAMES = 20_000  # of a camera, eleven minutes at 30 frames a second; of more, every second or third is looked at
+MAX_FRAMES = 20_000  # of a camera: eleven minutes at 30 frames a second; of more, every second or third is used
 
 
 def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
-    """Return the clocks of the cameras in a folder, and per camera what they come from, in words.
+    """Return the clocks of the cameras in a folder, and per camera their source, in words.
 
-    Each camera is read by itself, with its own frames and times. Where the folder has a calibration, the cameras'
-    geometry tells offsets apart that look alike without. Raises InputError where the recordings do not tell.
+    Each camera is read separately, with its own frames and times. If the folder has a calibration, the cameras'
+    geometry distinguishes offsets that would otherwise look alike. Raises InputError if the recordings do not determine
+    the clocks.
     """
     names = cameras_without_calibration(folder)
     if not names:
@@ -62,7 +63,7 @@ def _track(alone: Uncalibrated, name: str, fps: float, lens: Lens | None, scratc
     keypoints = subject_keypoints(capture)[name]
     scale = np.array(capture.recorded_sizes_px[name]) / capture.cameras[name].size_px
     keypoints[..., :2] = keypoints[..., :2] * scale + (scale - 1) / 2
-    if lens is not None and name not in capture.recorded_lenses:  # by which its images would be undistorted
+    if lens is not None and name not in capture.recorded_lenses:  # else ingestion undistorted them
         keypoints = undistort_keypoints(keypoints, lens.K, lens.distortion)
     footage = alone.footage(name)
     rows = np.searchsorted(footage.frames, capture.frames)
@@ -70,7 +71,7 @@ def _track(alone: Uncalibrated, name: str, fps: float, lens: Lens | None, scratc
 
 
 def _calibration(folder: Path, names: list[str]) -> dict[str, Lens]:
-    """Return the lenses of the folder's calibration; none if it has none, or not of all cameras."""
+    """Return the lenses of the folder's calibration; empty if there is none, or if it lacks a camera."""
     try:
         lenses = recognise(folder).lenses()
     except InputError:

@@ -12,22 +12,22 @@ from scipy.signal import resample
 from hnerf.capture.safe_io import path_in_capture
 from hnerf.errors import InputError
 
-RATE_HZ = 16_000  # to which sound is brought: a sample is 2 cm of its way
+RATE_HZ = 16_000  # to which sound is resampled: it travels 2 cm per sample
 BAND_HZ = (200.0, 7_000.0)  # below is hum and wind
-MIN_PEAK = 8.0  # standard deviations of the correlation, that its peak must rise
-RIVAL_S = 0.05  # within which other peaks are echoes of the same offset
+MIN_PEAK = 8.0  # minimum height of the peak, in standard deviations of the correlation
+RIVAL_S = 0.05  # other peaks within this are echoes of the same offset
 MIN_OVER_RIVAL = 1.3  # times the next peak
 MAX_SECONDS = 7_200.0
 
 
 def sound_offset(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Return by how many seconds later the second of two sound tracks (n,), (m,) at RATE_HZ shows a sound than the
-    first does; None where no peak stands out, one is silent, or one is shorter than the echoes of a sound.
+    """Return how many seconds later a sound is heard in the second of two sound tracks (n,), (m,) at RATE_HZ than in
+    the first; None if no peak stands out, one is silent, or one is shorter than the echoes of a sound.
 
     Generalised cross-correlation with the phase transform (Knapp and Carter 1976): every frequency counts alike, so
     that the direct sound makes a sharp peak and echoes, which differ between microphones, make lower ones. Sound needs
-    3 ms a metre: microphones at different distances hear it that much apart. Hours of sound take gigabytes, so all is
-    in single precision.
+    3 ms a metre, so that microphones at different distances hear it at different times. Hours of sound take gigabytes,
+    so all arrays are in single precision.
     """
     if min(len(a), len(b)) < 2 * RIVAL_S * RATE_HZ or not np.ptp(a) or not np.ptp(b):
         return None
@@ -50,9 +50,9 @@ def sound_offset(a: np.ndarray, b: np.ndarray) -> float | None:
 
 
 def read_sound(path: Path) -> np.ndarray | None:
-    """Return the sound (n,) at RATE_HZ of a video, from the .wav of the same name beside it, else, where the program
-    ffmpeg is installed, from the video itself; None where there is none. Raises InputError on a .wav that cannot be
-    read, or is a link."""
+    """Return the sound (n,) at RATE_HZ of a video, from the .wav of the same name next to it, else, if the program
+    ffmpeg is installed, from the video itself; None if there is none. Raises InputError on a .wav that cannot be read,
+    or is a link."""
     beside = path_in_capture(path.parent, path.with_suffix(".wav").name)
     if beside.is_file():
         return _read_wave(beside)
@@ -66,8 +66,8 @@ def read_sound(path: Path) -> np.ndarray | None:
 
 
 def _read_wave(path: Path) -> np.ndarray:
-    """Return the mean of the channels of a .wav of 16-bit samples, brought to RATE_HZ. Raises InputError if it is
-    none."""
+    """Return the mean of the channels of a .wav of 16-bit samples, resampled to RATE_HZ. Raises InputError if it is no
+    such file."""
     try:
         with wave.open(str(path)) as file:
             channels, width, rate_hz = file.getnchannels(), file.getsampwidth(), file.getframerate()

@@ -1,4 +1,5 @@
-"""Calibration from the person: cameras of a recording without any calibration, from the keypoints of whom it shows."""
+"""Calibration from the person: cameras of a recording without any calibration, from the keypoints of the person it
+shows."""
 
 import dataclasses
 import json
@@ -28,9 +29,9 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 PARTS = 5  # of the frames and of the joints: each is left out once
-MIN_MOTION = 0.05  # of the stature: how far parts of the person move, three times a detector's noise
-COLLINEAR = 0.02  # of the rig's length: cameras on one line, which leave a focal length open
-MAX_TURN_SD_DEG, MAX_MOVE_SD = 5.0, 0.1  # beyond which a camera is not determined; a share of its distance
+MIN_MOTION = 0.05  # of the stature: how far parts of the person must move, three times a detector's noise
+COLLINEAR = 0.02  # width over length of a rig whose cameras count as on one line, which leaves a focal length open
+MAX_TURN_SD_DEG, MAX_MOVE_SD = 5.0, 0.1  # beyond which a camera is not determined; the move as a share of its distance
 MAX_RESIDUAL_SHARE = 0.028  # of the person's height in pixels: where the calibration check rejects a camera
 
 log = logging.getLogger("hnerf.calibration")
@@ -38,7 +39,7 @@ log = logging.getLogger("hnerf.calibration")
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard errors of a camera: turn_deg of its direction, move_m of its place, focal of its focal length as a
+    """Standard errors of a camera: turn_deg of its direction, move_m of its position, focal of its focal length as a
     share."""
 
     turn_deg: float
@@ -50,8 +51,8 @@ class Uncertainty:
 class PersonCalibration:
     """Result of a calibration from the person. cameras: of the capture's images, Z up, metres; lenses: as recorded;
     uncertainty: by camera; measured: residuals of the keypoints; intrinsics: where each camera's come from, in words;
-    height_m: to which the rig was scaled; scale_sd: standard error of its scale, as a share; up_sd_deg: of up;
-    held_out_px: cost of each kind of lens that was tried."""
+    height_m: the person's, to which the rig was scaled; scale_sd: standard error of its scale, as a share; up_sd_deg:
+    of up; held_out_px: cost of each kind of lens that was tried."""
 
     cameras: list[Camera]
     lenses: list[Lens]
@@ -86,7 +87,7 @@ class PersonCalibration:
         }
 
     def notes(self) -> list[str]:
-        """Return what holds for the whole rig, in words."""
+        """Return notes about the whole rig, in words."""
         mean = "" if self.height_given else ", the mean of adults (give --height)"
         return [
             f"scale: a person of {self.height_m:.2f} m{mean}, +- {100 * self.scale_sd:.0f} %",
@@ -106,8 +107,8 @@ def calibrate_from_person(
     read.
 
     unknown_focal: cameras whose focal length is a guess, to be estimated; intrinsics: where each camera's come from, in
-    words; height_m: the person's, the mean stature if None. Lenses with distortion are left as keypoints have them.
-    Raises InputError where the recording does not determine the cameras.
+    words; height_m: the person's, the mean stature if None. If distortion was estimated, cameras are fitted to
+    keypoints only. Raises InputError if the recording does not determine the cameras.
     """
     if len(capture.train_cameras) < 2:
         raise InputError(f"{capture.name}: one camera cannot be calibrated from the person; film with two or more")
@@ -150,8 +151,8 @@ def calibrate_from_person(
 
 
 def _each_alone(capture: Capture) -> np.ndarray:
-    """Return the keypoints (C, frames, 25, 3) of the person whom each camera by itself takes for the subject: who is
-    named there, else who has the best claim."""
+    """Return the keypoints (C, frames, 25, 3) of the person whom each camera separately takes as the subject: the one
+    named there, else the one with the best claim."""
     found = subject_keypoints(dataclasses.replace(capture, subject_point=None))
     if point := capture.subject_point:
         found |= subject_keypoints(dataclasses.replace(capture, train_cameras=(point.camera,)))
@@ -161,7 +162,7 @@ def _each_alone(capture: Capture) -> np.ndarray:
 def _check_determined(
     cameras: Sequence[Camera], found: Measure, keypoints: np.ndarray, unknown_focal: Sequence[str]
 ) -> None:
-    """Raise InputError where the recording cannot determine a rig, whatever it was adjusted to."""
+    """Raise InputError if the recording cannot determine a rig, whatever the adjustment found."""
     worst = max(found.median_px, key=found.median_px.__getitem__)
     if found.median_px[worst] > MAX_RESIDUAL_SHARE * median_height_px(keypoints):
         raise InputError(
@@ -185,7 +186,7 @@ def _check_determined(
 
 
 def _motion(points_m: np.ndarray) -> float:
-    """Return how far the parts of a person (frames, 25, 3) that move most move from their median place, as a share of
+    """Return how far the most mobile parts of a person (frames, 25, 3) move from their median position, as a share of
     the stature: the median over frames, for the joint at the 90th percentile."""
     seen_m = points_m[:, np.isfinite(points_m).all(-1).any(0)]
     away = np.linalg.norm(seen_m - np.nanmedian(seen_m, axis=0), axis=-1)
@@ -212,7 +213,7 @@ def _uncertainty(
 
 
 def _again(cameras: Sequence[Camera], keypoints: np.ndarray, unknown: Sequence[str], fit: LensFit) -> list[Camera]:
-    """Return the rig adjusted to a part of the keypoints, with the unknowns of the whole."""
+    """Return the rig adjusted to a part of the keypoints, with the same unknowns as the whole fit."""
     names = [camera.name for camera in cameras]
     if not unknown:
         return adjust(cameras, keypoints, names)

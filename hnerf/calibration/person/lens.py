@@ -15,7 +15,8 @@ Fit = Callable[[list[Camera], np.ndarray], tuple[list[Camera], float]]  # of a r
 
 
 class LensFit(NamedTuple):
-    """Cameras with the lenses found. k1: OpenCV's, of all of them; what: which unknowns were estimated, in words."""
+    """Cameras with the lenses found. k1: OpenCV's, common to all estimated lenses; what: which unknowns were estimated,
+    in words."""
 
     cameras: list[Camera]
     k1: float
@@ -28,9 +29,9 @@ def fit_lenses(
     """Return the rig with the focal lengths of the cameras named in `unknown`, and the costs in pixels of what was
     tried on held-out keypoints.
 
-    One zoom of all unknown lenses is always estimated. Distortion and, then, a focal length for each camera are taken
-    only where held-out frames and joints improve by the share `min_improvement`: with few poses they explain noise, and
-    a wrong focal length moves a camera along its line of sight. keypoints (C, frames, 25, 3).
+    One zoom of all unknown lenses is always estimated. Distortion and, then, a focal length for each camera are
+    accepted only if held-out frames and joints improve by the share `min_improvement`: with few poses they explain
+    noise, and a wrong focal length moves a camera along its line of sight. keypoints (C, frames, 25, 3).
     """
     if not unknown:
         return LensFit(adjust(cameras, keypoints, [camera.name for camera in cameras]), 0.0, ""), {}

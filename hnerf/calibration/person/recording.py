@@ -15,11 +15,11 @@ from hnerf.errors import InputError
 def calibrate_recording(
     folder: Path, height_m: float | None = None, lens_file: Path | None = None, fov_deg: float | None = None
 ) -> PersonCalibration:
-    """Calibrate the cameras of a recording from its own keypoints, or from those of the network where it has none.
+    """Calibrate the cameras of a recording from its own keypoints, or from the network's if it has none.
 
-    A calibration that the folder may have is not read, but for the intrinsics of its `intri.yml` that no earlier
-    calibration from the person wrote there. Raises InputError where the recording cannot be read or does not determine
-    the cameras.
+    An existing calibration of the folder is not read, except for intrinsics in its `intri.yml` that no earlier
+    calibration from the person estimated. Raises InputError if the recording cannot be read or does not determine the
+    cameras.
     """
     if not cameras_without_calibration(folder):
         raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to calibrate from; add the recordings")

@@ -1,7 +1,7 @@
 """First poses of cameras from one person's keypoints: an essential matrix of two cameras, then camera by camera.
 
-The keypoints of all frames are one cloud of points, because cameras that stand still and see the same instants cannot
-tell a moving person from many people (wand calibration, with the person as the wand).
+The keypoints of all frames form one point cloud, because static, synchronised cameras cannot tell a moving person from
+many people (wand calibration, with the person as the wand).
 """
 
 import dataclasses
@@ -23,9 +23,9 @@ from hnerf.pycolmap_import import pycolmap
 
 INLIER_SHARE = 0.02  # of the person's height in pixels: about twice a detector's noise
 MIN_SHARED = 100  # keypoints that two cameras see at once: four whole people
-MIN_ANGLE_DEG = 5.0  # between the rays of two cameras: below it depth is ten times less certain than place
-START_FRAMES = 30  # evenly spaced, in which the first poses are found
-STARTS = 2  # pairs from which the rig is built, the best one kept
+MIN_ANGLE_DEG = 5.0  # between the rays of two cameras: below it depth is ten times less certain than lateral position
+START_FRAMES = 30  # evenly spaced frames in which the first poses are found
+STARTS = 2  # pairs from each of which a rig is built; the best rig is kept
 TRIALS = 500  # of RANSAC, for one camera against known points
 
 log = logging.getLogger("hnerf.calibration")
@@ -42,10 +42,10 @@ class _Pair(NamedTuple):
 def first_poses(cameras: Sequence[Camera], keypoints: np.ndarray) -> list[Camera]:
     """Return the cameras, whose intrinsics are known at least roughly, with poses up to a similarity transform.
 
-    keypoints (C, frames, 25, 3) of one person. Raises InputError where they do not link all cameras, whatever pair one
-    starts from, or where all cameras look from one direction.
+    keypoints (C, frames, 25, 3) of one person. Raises InputError if they do not link all cameras, whatever the starting
+    pair, or if all cameras look from one direction.
     """
-    pycolmap.logging.minloglevel = 2  # errors only: Ceres otherwise tells of every step that it takes back
+    pycolmap.logging.minloglevel = 2  # errors only: Ceres otherwise logs every step that it rejects
     chosen = keypoints[:, evenly_spaced(range(keypoints.shape[1]), START_FRAMES)]
     _check_shared(cameras, keypoints)
     inlier_px = INLIER_SHARE * median_height_px(keypoints)
@@ -112,8 +112,8 @@ def _colmap(camera: Camera) -> pycolmap.Camera:
 
 
 def _angle_deg(cameras: tuple[Camera, Camera], keypoints: np.ndarray) -> float:
-    """Return the median angle in degrees under which points see two cameras; of the lines, so that cameras that face
-    each other count as if they stood side by side."""
+    """Return the median angle in degrees between the lines from points to two cameras. Lines have no direction, so that
+    cameras that face each other count as if they were side by side."""
     projections = np.stack([camera.projection for camera in cameras])
     points_m = triangulate(projections, keypoints.reshape(2, -1, 3))[0]
     rays = np.stack([points_m - camera.centre_m for camera in cameras])
@@ -125,7 +125,7 @@ def _angle_deg(cameras: tuple[Camera, Camera], keypoints: np.ndarray) -> float:
 def _add_cameras(
     cameras: Sequence[Camera], keypoints: np.ndarray, first: tuple[int, int], pair: _Pair, inlier_px: float
 ) -> list[Camera]:
-    """Return all cameras, posed one after the other against the points of those before: the one that agrees most."""
+    """Return all cameras, posed one by one against the points of those before, each time the one that agrees most."""
     rig = dict(zip(first, pair.cameras, strict=True))
     while True:
         known = sorted(rig)

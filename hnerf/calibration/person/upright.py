@@ -1,4 +1,4 @@
-"""Up, ground and scale of a rig that the person alone determined: from the feet, the head and the person's height."""
+"""Up, ground and scale of a rig calibrated from the person alone: from the feet, the head and the person's height."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,19 +11,19 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MEAN_STATURE_M, STATURE_SD_M = 1.65, 0.09  # of adults: NCD-RisC 2016 has means of 1.71 (men) and 1.59 m (women)
-CHAIN_SD = 0.03  # share by which a stature from limb lengths is off: definitions of a detector's joints
+CHAIN_SD = 0.03  # relative error of a stature from limb lengths, due to how a detector defines joints
 ANKLES, NECK = (11, 14), 1  # BODY_25
 FEET = ((11, 22, 23, 24), (14, 19, 20, 21))  # ankle, toes and heel of the right and of the left foot
 LEAN_SD = np.tan(np.deg2rad(6.0))  # of the mean direction from ankles to neck: people lean as they walk and reach
 ROLL_SD = np.deg2rad(3.0)  # of a camera about its line of sight: people hold and mount cameras level
 CONTACT_SD_M = 0.02  # of a standing foot's lowest keypoint above the ground
-STEP_S = 1 / 3  # of a walk: frames of one step say the same about the ground
+STEP_S = 1 / 3  # duration of a step: its frames all say the same about the ground
 ROUNDS = 30  # of iteratively re-weighted least squares
 FIRST_SCALE = 4.0  # times the standard deviations, from which the Cauchy scale shrinks to 1
 
 
 def scale_to(cameras: Sequence[Camera], points: np.ndarray, height_m: float) -> tuple[list[Camera], np.ndarray]:
-    """Return the rig and its points (frames, 25, 3) scaled so that the person has this height. Raises InputError where
+    """Return the rig and its points (frames, 25, 3) scaled so that the person has this height. Raises InputError if
     legs, trunk or nose were never seen by two cameras."""
     found = body_height_m(points)
     if not np.isfinite(found):
@@ -41,7 +41,7 @@ def stand_on_ground(
     """Return the rig and its points (frames, 25, 3) in a world with Z up, the ground at 0 below the middle of the
     person's path, and the first camera towards -Y; and the standard error of up in degrees.
 
-    frame_s: seconds from one of the frames to the next. Raises InputError where ankles and neck are never seen.
+    frame_s: seconds between successive frames. Raises InputError if ankles and neck are never seen.
     """
     world, up_sd = _upright(cameras, points_m, frame_s)
     turned_m = points_m @ world.T
@@ -61,10 +61,10 @@ def stand_on_ground(
 def _upright(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) -> tuple[np.ndarray, float]:
     """Return the rotation (3, 3) to a world with Z up, and the standard error of up in radians.
 
-    Up is the normal (-a, -b, 1) of the ground z = a x + b y + c on which the lower keypoints of standing feet lie, as
-    far as their path is wide enough; it is along the mean direction from ankles to neck; and it is at right angles to
-    the x axes of cameras that are held level (Brown and Lowe 2007, section 5). Each has Cauchy weights, since a foot
-    may swing, a person lean and a camera be tilted.
+    Three cues determine up. It is the normal (-a, -b, 1) of the ground z = a x + b y + c on which the lower keypoints
+    of standing feet lie, as far as their path is wide enough; it is the mean direction from ankles to neck; and it is
+    perpendicular to the x axes of level cameras (Brown and Lowe 2007, section 5). Each cue has Cauchy weights, since a
+    foot may swing, a person may lean and a camera may be tilted.
     """
     world = _rotation(_body_direction(points_m))
     for scale in np.geomspace(FIRST_SCALE, 1, ROUNDS):
@@ -80,7 +80,7 @@ def _upright(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) ->
             np.array([[-1, 0, 0, body[0] / body[2]], [0, -1, 0, body[1] / body[2]]]) / LEAN_SD,
             np.column_stack([sideways[:, :2], np.zeros(len(sideways)), sideways[:, 2]]) / ROLL_SD,
         ]
-        counts = [0.5 * min(1.0, frame_s / STEP_S), 1.0, 1.0]  # of each foot, a step counts as one frame
+        counts = [0.5 * min(1.0, frame_s / STEP_S), 1.0, 1.0]  # the frames of one step of each foot count as one
         A = np.concatenate([np.sqrt(count) * part for part, count in zip(rows, counts, strict=True)])
         off = np.concatenate([part[:, 3] for part in rows])
         off[len(feet_m) : len(feet_m) + 2] = np.linalg.norm(off[len(feet_m) : len(feet_m) + 2])
@@ -88,7 +88,7 @@ def _upright(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) ->
         normal = (A[:, :3] * weights[:, None]).T @ A[:, :3] + 1e-9 * np.eye(3)
         a, b, _ = np.linalg.solve(normal, (A[:, :3] * weights[:, None]).T @ A[:, 3])
         world = _rotation(np.array([-a, -b, 1.0])) @ world
-    contradiction = float(np.sqrt(np.mean(off[len(feet_m) :] ** 2)))  # of body and cameras: a lean, tilted cameras
+    contradiction = float(np.sqrt(np.mean(off[len(feet_m) :] ** 2)))  # by body and cameras: leaning, tilted cameras
     return world, max(1.0, contradiction) * float(np.sqrt(np.linalg.inv(normal)[:2, :2].diagonal().max()))
 
 
@@ -106,7 +106,7 @@ def _body_direction(points_m: np.ndarray) -> np.ndarray:
 
 
 def _rotation(up: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation (3, 3) that takes a direction to +Z."""
+    """Return the smallest rotation (3, 3) that maps a direction to +Z."""
     return np.asarray(Rotation.align_vectors([[0.0, 0, 1]], up[None])[0].as_matrix())
 
 
