@@ -59,7 +59,7 @@ def raised_above_ground(camera: Camera, keypoints: np.ndarray, up: str, stature_
         return camera, ""
     by_a_metre = dataclasses.replace(camera, t_m=camera.t_m - camera.R @ vertical)
     height_m = stature_m / stature_on_ground_m(by_a_metre, keypoints, up)
-    if not 0 < height_m < np.inf:  # such as of a person who lies with the head towards the camera
+    if not 0 < height_m < np.inf:  # as when a person lies with the head towards the camera
         return camera, ""
     words = (
         f"its height is not known: {height_m:.2f} m if the camera is level and the person stands {stature_m:.2f} m tall"

@@ -25,7 +25,7 @@ STEP = np.array([0.002] * 3 + [0.003] * 3)  # of finite differences: about a pix
 FOCAL_STD, FOCAL_STEP = 0.2, 0.02  # of the logarithm of a focal length from keypoints
 LOSS_SCALE_PX = 0.5  # of Cauchy's loss: errors of masks are larger
 EVALUATIONS = 20
-MIN_COST_DECREASE = 0.01  # as a share: a smaller step is the last
+MIN_COST_DECREASE = 0.01  # as a share of the cost: a step that decreases it less is the last
 MIN_GAIN_PX = 0.01  # on outlines at held-out instants; cameras from keypoints without bias leave 0.006 px on valid-wave
 
 log = logging.getLogger("hnerf.calibration")

@@ -178,8 +178,8 @@ def _refine_for_size(
     must_beat_px: float,
     held_out_px: dict[str, float],
 ) -> tuple[list[Camera], list[str]]:
-    """Return the cameras, with intrinsics that explain a recorded size other than the calibrated one without black bars
-    if held-out frames prove them, and notes.
+    """Try intrinsics that explain recorded sizes that differ from the calibrated ones without black bars. Return the
+    cameras, with those intrinsics if held-out frames prove them, and notes.
 
     Adds the costs of what was tried to `held_out_px`.
     """

@@ -211,8 +211,8 @@ def read_board_footage(
 def _corners(
     board: Board, pictures: Footage, numbers: tuple[int, ...], frames: tuple[int, ...]
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the corners of one camera, (frames, N, 2), and the size of its images. numbers: for each of the camera's
-    own frames, its number common to all cameras."""
+    """Return the corners of one camera, (frames, N, 2), and the size of its images. numbers: as from `_frame_numbers`,
+    for each of the camera's own frames."""
     detector, size_px = BoardDetector(board), None
     corners_px = np.full((len(frames), len(board.corners_m), 2), np.nan)
     row = {frame: i for i, frame in enumerate(frames)}
@@ -241,7 +241,8 @@ def _check_markers(source: Path, board: Board) -> None:
 
 
 def _from_caliscope(path: Path) -> dict[str, Any]:
-    """Convert Caliscope's charuco.toml to keys of `Board`; a measured square size overrides the page's."""
+    """Convert Caliscope's charuco.toml to keys of `Board`; a square size measured on the print overrides the one that
+    follows from the page."""
     table = safe_io.read_toml(path)
     try:
         square_m = 0.01 * float(table.get("square_size_override_cm") or 0)
@@ -283,7 +284,7 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
 
 
 def _frame_numbers(root: Path, footage: dict[str, Footage], synchronised: bool) -> dict[str, tuple[int, ...]]:
-    """Return, by camera, the number of each of its frames that is common to all cameras."""
+    """Return, by camera, the number of each of its frames, which simultaneous frames of all cameras share."""
     stamps = safe_io.path_in_capture(root, "timestamps.csv")
     if not synchronised or not stamps.exists():
         videos = [pictures for pictures in footage.values() if isinstance(pictures, Video)]

@@ -27,7 +27,7 @@ log = logging.getLogger("hnerf.capture")
 
 
 class Clock(NamedTuple):
-    """A camera's clock: it shows rate t + offset_s at the instant t, in seconds."""
+    """A camera's clock: it shows rate * t + offset_s at the instant t, in seconds."""
 
     offset_s: float = 0.0
     rate: float = 1.0
@@ -83,7 +83,7 @@ class InStep:
 
 
 def read_clocks(folder: Path) -> dict[str, Clock]:
-    """Return the clocks of `clocks.toml` by camera; none without that file. Raises InputError on a bad value."""
+    """Return the clocks of `clocks.toml` by camera; empty without that file. Raises InputError on a bad value."""
     path = path_in_capture(folder, FILE)
     if not path.exists():
         return {}

@@ -405,7 +405,7 @@ def _per_frame(
 
 
 def _people_in_step(layout: Layout, footage: dict[str, Footage | InStep]) -> dict[str, np.ndarray]:
-    """Return what `detections` finds, by camera, at the instants of all cameras."""
+    """Return the `detections` of each camera that has some, at the common instants."""
     people = {}
     for camera, recording in footage.items():
         found = detections(layout, camera, recording.source if isinstance(recording, InStep) else recording)

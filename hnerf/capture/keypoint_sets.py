@@ -98,7 +98,7 @@ def _combined(points: np.ndarray, known: KeypointSet) -> np.ndarray:
 
 
 def is_body_25(keypoints: np.ndarray) -> bool:
-    """Return whether (..., 25, 3) detections are in BODY_25's order rather than BODY_25B's; True if they do not tell.
+    """Return whether (..., 25, 3) detections are in BODY_25's order rather than BODY_25B's; True if undecided.
 
     BODY_25's points 1 to 4 are neck and right arm, and 15 to 18 are eyes and ears; BODY_25B's points 1 to 4 are eyes
     and ears, and among 15 to 18 are the ankles. From every side, a face is smaller than the extent of the other points,

@@ -9,11 +9,11 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import confidence_of, solve_points
 
 AGREEMENT_REACH = 0.15  # of a person's height in the image: beyond it a keypoint does not support a hypothesis
-UNSUPPORTED_WEIGHT = 0.1  # of a detection without support from other cameras: one may be badly calibrated
+UNSUPPORTED_WEIGHT = 0.1  # of a detection without support from other cameras: one of them may be badly calibrated
 MIN_SUPPORT = 0.2  # agreement of others with a detection (0.8 for a good one) that is no chance hit of a few keypoints
 USUALLY = 0.5  # if others support at least this share of a camera's images, its unsupported detections are mistakes
 CANDIDATES = 8  # combinations of people kept in each frame
-JUMP_COST = 4.0  # in best scores of one camera, for moving by the person's own height between frames
+JUMP_COST = 4.0  # in best scores of one camera, of a move by the person's own height between frames
 FREE_JUMPS = 2.0  # in median movements between frames: jumps up to this cost nothing
 MAX_PAIRED = 12  # most prominent people of an image who are compared with those of other cameras
 MAX_PEOPLE = 4  # followed: the subject, and those whom the report lists as left out

@@ -35,7 +35,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov")
 JSON_SUFFIXES = (".json",)
 _IMAGE_MODES = ("1", "L", "LA", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
 _EXIF_ORIENTATION = 0x112
-_UPRIGHT = dict(enumerate(  # by EXIF orientation, 2 to 8: what turns the picture upright
+_UPRIGHT = dict(enumerate(  # by EXIF orientation, 2 to 8: the operation that turns the image upright
     (Image.Transpose.FLIP_LEFT_RIGHT, Image.Transpose.ROTATE_180, Image.Transpose.FLIP_TOP_BOTTOM,
      Image.Transpose.TRANSPOSE, Image.Transpose.ROTATE_270, Image.Transpose.TRANSVERSE, Image.Transpose.ROTATE_90), 2
 ))  # fmt: skip
@@ -99,7 +99,7 @@ def _spelled(folder: Path, name: str) -> str:
 
 def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Path]:
     """Return the files of a folder inside the capture, sorted by name; an empty list if there is no such folder.
-    suffixes: those to keep, in lower case, whatever their case in file names; none keeps all. Raises InputError if a
+    suffixes: those to keep, in lower case, whatever their case in file names; empty keeps all. Raises InputError if a
     file is in the folder's place."""
     folder = path_in_capture(root, *parts)
     for place in (root.joinpath(*parts[:depth]) for depth in range(1, len(parts) + 1)):
@@ -125,7 +125,7 @@ def file_named(root: Path, stem: str, *parts: str, suffixes: tuple[str, ...]) ->
 
 def by_camera(paths: list[Path]) -> dict[str, Path]:
     """Return files by the camera that they are named after. Raises InputError on a name that no camera can have, or if
-    two files have the same."""
+    two files are named after one camera."""
     found: dict[str, Path] = {}
     for path in paths:
         name = check_camera_name(path.stem, path)

@@ -21,7 +21,7 @@ def focal_35mm(path: Path) -> float | None:
     readable one."""
     try:
         found = _of_video(path) if path.suffix.lower() in VIDEO_SUFFIXES else _of_image(path)
-    except (Image.DecompressionBombError, OSError, OverflowError, SyntaxError, ValueError):  # whoever reads it reports
+    except (Image.DecompressionBombError, OSError, OverflowError, SyntaxError, ValueError):  # reported when it is read
         return None
     return found if found and 1 <= found <= 2000 else None
 

@@ -27,7 +27,7 @@ PASSES = 2  # the second searches where the first found the hand
 PALM = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # points that determine the next region
 KNUCKLES = ([9], [5, 13])  # the hand's direction: half from the middle finger's, half from its neighbours'
 AHEAD, AROUND = 0.1, 2.0  # of the next region: shift towards the finger tips, and side, in sizes of the palm
-FAR = 0.5  # of the region's side: a hand whose wrist is farther from the body's is another hand
+FAR = 0.5  # of the region's side: a hand whose wrist is farther from the body's wrist is another hand
 SAME = 0.25  # of the region's side: median point distance below which two hands are the same one
 FOUND = 0.5  # confidence above which a hand counts as found, in the report
 

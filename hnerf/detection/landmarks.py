@@ -8,7 +8,7 @@ from hnerf.detection.network import Network, sigmoid
 from hnerf.detection.region import Region, region_around
 
 SIZE, POINTS = 256, 33  # followed by two auxiliary points, which determine the next region
-HEAT_WINDOW, MIN_HEAT = 3, 0.5  # cells on each side of a point, and the least maximum of heat among them
+HEAT_WINDOW, MIN_HEAT = 3, 0.5  # cells on each side of a point, and the minimum peak of the heat in them
 MIN_PRESENCE = 0.5  # probability that a region shows a person; below it, nobody is there
 
 

@@ -1,4 +1,5 @@
-"""Four sources of masks behind one interface: given, learned, against a clean plate, against a median over time."""
+"""Four sources of masks behind one interface: given, learned, difference from a clean plate or from a median over
+time."""
 
 from dataclasses import dataclass, field
 

@@ -96,8 +96,8 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
 def board_evidence(capture: Capture) -> dict[str, Any] | None:
     """Return what board footage says about a capture's cameras; None if the recording has none.
 
-    "cameras": per camera the corners' distances (px) from the board that all cameras agree on, with the cameras as
-    given, and as `footage_rms_px` with those estimated from the footage itself. "pairs": `compare_pairs` of the two.
+    "cameras": per camera, the corners' distances (px) from the board that all cameras agree on, with the cameras as
+    given and, as `footage_rms_px`, with cameras estimated from the footage itself. "pairs": `compare_pairs` of the two.
     "unlinked_cameras": those that never see the board together with the others, about which nothing is known.
     """
     stored = load_board_corners(capture.root)

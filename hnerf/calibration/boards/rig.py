@@ -22,8 +22,8 @@ Views = dict[tuple[int, int], Pose]  # camera from board, by (camera, frame)
 
 
 def fixes_pose(corners_m: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return (...,) bool: whether the corners seen (..., N) bool determine a pose: enough of them, with two or more in
-    each of two rows."""
+    """Return whether the corners `seen` (..., N) bool determine a pose, (...,) bool: enough of them, with two or more
+    in each of two rows."""
     rows = np.unique(corners_m[:, 1])
     in_row = np.stack([seen[..., corners_m[:, 1] == row].sum(-1) for row in rows], -1)
     return (seen.sum(-1) >= MIN_CORNERS) & ((in_row >= 2).sum(-1) >= 2)

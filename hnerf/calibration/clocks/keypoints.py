@@ -55,7 +55,7 @@ class PairClock(NamedTuple):
 
 
 class _Path(NamedTuple):
-    """A smoothed track: times_s (n,); moments (3, n, 25, 2), the positions, velocities per second and accelerations;
+    """A smoothed track: times_s (n,); moments (3, n, 25, 2), the positions, velocities and accelerations, in seconds;
     known (n, 25); to_unit (3, 3), which maps homogeneous pixels to positions of mean 0 and standard deviation 1."""
 
     times_s: np.ndarray

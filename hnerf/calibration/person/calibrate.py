@@ -32,7 +32,7 @@ PARTS = 5  # of the frames and of the joints: each is left out once
 MIN_MOTION = 0.05  # of the stature: how far parts of the person must move, three times a detector's noise
 COLLINEAR = 0.02  # width over length of a rig whose cameras count as on one line, which leaves a focal length open
 MAX_TURN_SD_DEG, MAX_MOVE_SD = 5.0, 0.1  # beyond which a camera is not determined; the move as a share of its distance
-MAX_RESIDUAL_SHARE = 0.028  # of the person's height in pixels: where the calibration check rejects a camera
+MAX_RESIDUAL_SHARE = 0.028  # of the person's height in pixels: from here on the calibration check rejects a camera
 
 log = logging.getLogger("hnerf.calibration")
 

@@ -32,7 +32,8 @@ log = logging.getLogger("hnerf.calibration")
 
 
 class _Pair(NamedTuple):
-    """Two cameras with their relative pose; agreeing: keypoints that fit it; angle_deg: median angle of their rays."""
+    """Two cameras with their relative pose; agreeing: number of keypoints that fit it; angle_deg: median angle of their
+    rays."""
 
     cameras: tuple[Camera, Camera]
     agreeing: int

@@ -23,7 +23,7 @@ class StoredFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout(ABC):
-    """A capture folder in one layout. Methods for what most layouts lack return nothing by default.
+    """A capture folder in one layout. Methods for data that most layouts lack return nothing by default.
 
     `mark`: a file, or a folder with a trailing slash, that only this layout has; its name may have wildcards.
     `novel_pose_share`: share of the frames for novel poses if no `capture.toml` splits them.

@@ -24,7 +24,7 @@ log = logging.getLogger("hnerf.capture")
 @dataclass(frozen=True)
 class Videos(EasyMocap):
     """Videos of a person, with keypoints, masks and clean plates as in the EasyMocap layout. A single video needs no
-    calibration: its camera is held level, with the lens of `intri.yml`, or the field of view that `capture.toml`
+    calibration: its camera is taken to be level, with the lens of `intri.yml`, or the field of view that `capture.toml`
     states. Several need their relative poses."""
 
     @classmethod

@@ -66,7 +66,7 @@ class ZjuMocap(Layout):
         return read_pickled_npy(self.source)
 
     def lenses(self) -> dict[str, Lens]:
-        """Return one camera for each of a frame's images."""
+        """Return one camera for each image of a frame."""
         lenses = {}
         for i, name in enumerate(self.images):
             try:
