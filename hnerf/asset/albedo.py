@@ -1,4 +1,4 @@
-"""The albedo of texels: photographs' colours, divided by the light at the normals that the texels had in them."""
+"""The albedo of texels: their colours in the photographs, divided by the irradiance at their normals there."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -23,9 +23,9 @@ class Albedo:
 
 
 class AlbedoBlend:
-    """The mean albedo of texels over photographs in linear light, weighted like the captured colours and by the
-    irradiance, since noise weighs less in the light. The field's colours (N, 3), seen at irradiances (N,), count a
-    little everywhere."""
+    """The mean albedo of texels over photographs, in linear light. The weights of `CapturedBlend` are multiplied by the
+    irradiance, since noise matters less in bright light. The field's colours (N, 3), seen at irradiances (N,), have a
+    small weight everywhere."""
 
     def __init__(self, field_colours: np.ndarray, field_irradiance: np.ndarray, light: Light) -> None:
         self._light = light
@@ -36,7 +36,7 @@ class AlbedoBlend:
         self._projection = BackProjection()
 
     def add(self, seen: SeenTexels) -> None:
-        """Take in a photograph."""
+        """Add a photograph."""
         irradiance = self._light.irradiance(seen.normals).astype(np.float32)[:, None]
         counts = seen.weights(to_srgb(self._field.take(seen.index, 0) * irradiance))
         self._irradiance[seen.index] += counts * irradiance
@@ -50,6 +50,6 @@ class AlbedoBlend:
 
 
 def mean_irradiance(light: Light, surfaces_m: Iterable[np.ndarray], faces: np.ndarray, texels: Texels) -> np.ndarray:
-    """Return the mean irradiance of texels (N,) over some surfaces (V, 3)."""
+    """Return the mean irradiance (N,) of texels over several posed surfaces (V, 3)."""
     normals = [unit(texels.interpolate(normals_of(surface_m, faces), faces)) for surface_m in surfaces_m]
     return np.mean([light.irradiance(of_texels) for of_texels in normals], 0)

@@ -1,5 +1,5 @@
-"""The asset's textures: the field's colours and what the training photographs show, in the recording's light and
-without it."""
+"""The asset's textures, from the field's colours and the training photographs: with the recording's light and without
+it."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.render.motion import select_poses
 from hnerf.side_by_side import side_by_side
 
-FIELD_PX = 512  # side of the texture in which photographs find the field's colours; it shows nothing as fine as theirs
+FIELD_PX = 512  # side of the field's texture that photographs are blended with; the field has less detail than they
 CAVITY_BRIGHTNESS = 0.3  # factor of sRGB values
 
 
@@ -30,9 +30,12 @@ def baked_textures(
     settings: AssetSettings,
     cavities: np.ndarray,
 ) -> tuple[np.ndarray, Albedo | None]:
-    """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, and its albedo, unless it is the field's alone.
-    surfaces_m (n, V, 3): its surface in the world in each frame; cavities (V,) bool: vertices deep inside mouth
-    and nose, which are as dark as places that little light gets to."""
+    """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, and its albedo; no albedo if the texture is the
+    field's alone.
+
+    surfaces_m (n, V, 3): the body's surface in the world in each frame; cavities (V,) bool: vertices deep inside mouth
+    and nose, which are darkened because little light reaches them.
+    """
     texels, faces = rasterise(layout, settings.texture_px), clothed.rig.faces.numpy()
     lit = texels.interpolate(np.where(cavities, CAVITY_BRIGHTNESS, 1.0)[:, None], faces)
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
@@ -61,7 +64,7 @@ def baked_textures(
 def _coarse_field_colours(
     avatar: Avatar, posed: BodyFit, layout: UvLayout, texels: Texels, texture_px: int, cavities: np.ndarray
 ) -> np.ndarray:
-    """Return the field's colours at texels of a texture, (N, 3), from those of a smaller one."""
+    """Return the field's colours at a texture's texels, (N, 3), sampled from a smaller texture."""
     side_px = min(texture_px, max(FIELD_PX, texture_px // 2))  # no smaller: charts lie a few texels apart
     coarse = rasterise(layout, side_px)
     image = texture_image(coarse, field_colours(avatar, posed, coarse, cavities), side_px)

@@ -1,4 +1,4 @@
-"""A glTF binary file made smaller for a web page: opaque images as JPEG, blend shapes in coarser steps, which compress
+"""Shrink a glTF binary file for a web page: opaque images become JPEG, blend shapes are rounded to compress better
 (glTF 2.0 specification, Khronos Group)."""
 
 import json
@@ -16,8 +16,8 @@ JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
 def compact_glb(glb: bytes, texture_px: int) -> bytes:
-    """Return the file with each opaque image as JPEG, its longer side at most texture_px, and what morph targets change
-    rounded to TARGET_STEPS; all else is as it was."""
+    """Return the file with each opaque image as a JPEG whose longer side is at most texture_px, and with the offsets of
+    morph targets rounded to TARGET_STEPS. All else is unchanged."""
     document, binary = read_glb(glb)
     steps = _steps_of_targets(document)
     images = {image["bufferView"]: image for image in document.get("images", []) if "bufferView" in image}
@@ -43,7 +43,7 @@ def read_glb(glb: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def as_glb(document: dict[str, Any], binary: bytes) -> bytes:
-    """Return a binary file; each of its chunks ends at a multiple of four bytes, JSON in spaces and binary in zeros."""
+    """Return a binary file. Chunks are padded to multiples of four bytes, JSON with spaces and binary with zeros."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary += bytes(-len(binary) % 4)
@@ -52,7 +52,7 @@ def as_glb(document: dict[str, Any], binary: bytes) -> bytes:
 
 
 def _steps_of_targets(document: dict[str, Any]) -> dict[int, float]:
-    """Return the steps in which morph targets are kept, by the buffer view of their values."""
+    """Return the rounding step of each morph target, by the buffer view of its values."""
     steps = {}
     for mesh in document["meshes"]:
         for primitive in mesh["primitives"]:
@@ -64,7 +64,7 @@ def _steps_of_targets(document: dict[str, Any]) -> dict[int, float]:
 
 
 def _rounded(content: bytes, step: float) -> bytes:
-    """Return float32 numbers rounded to multiples of a power of two, whose last bits are zero."""
+    """Return float32 numbers rounded to multiples of a power of two, so that their last bits are zero."""
     return (np.round(np.frombuffer(content, "<f4") / step) * step).astype("<f4").tobytes()
 
 

@@ -1,5 +1,5 @@
-"""The asset's looks, and its splats, against the field they were made from: all in the same views, scored by the
-photograph under its mask."""
+"""Comparison of the asset's looks and splats with the field that they were made from: all in the same views, scored
+against the masked photograph."""
 
 import logging
 from dataclasses import dataclass
@@ -26,20 +26,20 @@ from hnerf.geometry.mesh_queries import Surface
 from hnerf.progress import tracked
 from hnerf.side_by_side import side_by_side
 
-IMAGES = 6  # few: a field on two cores renders one in about a second
+IMAGES = 6  # few: on two cores, the field takes about a second to render one
 LONGEST_PX = 300  # of the person's box, for the same reason; larger boxes are scaled down
-SHORTEST_PX = 12  # SSIM needs 11; a person who is nearly out of the picture has less
-POOR_DB = 4.0  # below its field, an asset lost what the field knew
-LOOKS = {"captured look": "asset", "albedo in its own light": "albedo"}  # what renders show them
+SHORTEST_PX = 12  # SSIM needs 11; the box of a person at the image's edge may have fewer
+POOR_DB = 4.0  # further below its field, an asset has lost what the field knew
+LOOKS = {"captured look": "asset", "albedo in its own light": "albedo"}  # by the names of their renders
 
 log = logging.getLogger("hnerf.asset")
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One view, in the person's box: photograph (H, W, 3) over black; renders (H, W, 4), over black with their
-    coverage; uint8. Renders and their scores are of "field", "asset" (the captured look), and, if there are any,
-    "albedo" (in the light that was estimated with it) and "splats"."""
+    """One view, cropped to the person's box. photograph (H, W, 3) and renders (H, W, 4), with their coverage, are uint8
+    over black. Renders and their scores are of "field", "asset" (the captured look), and, if there are any, "albedo"
+    (in the light that was estimated with it) and "splats"."""
 
     view: View
     photograph: np.ndarray
@@ -50,8 +50,8 @@ class Compared:
 def compare_with_field(
     capture: Capture, masks: Masks, avatar: Avatar, staged: StagedAvatar, splats: Splats | None = None
 ) -> list[Compared]:
-    """Return at most IMAGES views of training frames, from test cameras if the recording has masks of these, else from
-    training cameras. None if no view has a mask."""
+    """Compare at most IMAGES views of training frames: from test cameras if the recording has masks for them, else from
+    training cameras. Return none if no view has a mask."""
     tested = [view for view in all_views(capture, NOVEL_VIEW) if capture.has_given_mask(view.camera, view.frame)]
     trained = [view for view in all_views(capture, TRAINING_VIEW) if (view.camera, view.frame) in masks]
     chosen = sample_views(tested or trained, IMAGES)
@@ -68,8 +68,8 @@ def compare_with_field(
 
 
 def comparison_figures(compared: list[Compared]) -> dict[str, Any]:
-    """Return the mean scores of field, looks and splats, by how much the captured look is below, and those of each
-    image."""
+    """Return the mean scores of the field, the looks and the splats, how far the captured look is below the field, and
+    the scores of each image."""
     if not compared:
         return {"images": 0, "reason": "no image has a mask of the person"}
     means = {
@@ -88,8 +88,11 @@ def comparison_figures(compared: list[Compared]) -> dict[str, Any]:
 
 
 def require_close(name: str, topology: str, figures: dict[str, Any], allow_poor: bool) -> None:
-    """Raise InvalidAsset if no look of the asset of a capture called `name`, with the mesh of that topology, is within
-    POOR_DB of its field. Warn if one is not, or with `allow_poor`. figures: see `comparison_figures`."""
+    """Raise InvalidAsset if every look of the asset is more than POOR_DB below its field. If only one is, or with
+    `allow_poor`, warn instead.
+
+    name: of the capture; topology: of the mesh; figures: see `comparison_figures`.
+    """
     if not figures["images"]:
         return
     below_db = {
@@ -116,17 +119,17 @@ def require_close(name: str, topology: str, figures: dict[str, Any], allow_poor:
 
 
 def _mask(capture: Capture, masks: Masks, view: View) -> np.ndarray:
-    """Return a view's mask (H, W) bool: of training cameras the segmentation's, of test cameras the recording's
-    own."""
+    """Return a view's mask (H, W) bool: the segmentation's for training cameras, the recording's own for test
+    cameras."""
     if view.split != NOVEL_VIEW:
         return masks.get(view.camera, view.frame)
     given = capture.given_mask(view.camera, view.frame)
-    assert given is not None  # views without were left out
+    assert given is not None  # views without a mask were left out
     return given
 
 
 def _skinned_surfaces(staged: StagedAvatar, frames: list[int]) -> dict[int, Surface]:
-    """Return the asset's surface in the world in some frames, with correctives, as programs skin it."""
+    """Return the asset's surface in the world in some frames, with correctives, as other programs skin it."""
     wanted = sorted(set(frames))
     rows = [list(staged.frames).index(frame) for frame in wanted]
     moved = staged.rigs[FULL].surfaces_m(CAPTURED, staged.rest, rows)

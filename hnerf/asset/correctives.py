@@ -1,4 +1,5 @@
-"""Corrective blend shapes: what the surfaces of frames have beyond skinning, in a few shapes with a weight a frame."""
+"""Corrective blend shapes: the part of each frame's surface that skinning misses, as a few shapes with weights per
+frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,25 +18,25 @@ from hnerf.side_by_side import side_by_side
 
 @dataclass(frozen=True)
 class Correctives:
-    """Blend shapes of a surface. offsets_m (K, V, 3): displacements in the rest pose at weight 1; weights (n, K) by
-    frame."""
+    """Blend shapes of a surface. offsets_m (K, V, 3): displacements in the rest pose at weight 1; weights (n, K): one
+    row per frame."""
 
     offsets_m: np.ndarray
     weights: np.ndarray
 
 
 def as_they_are(displacement_m: np.ndarray) -> np.ndarray:
-    """Return the displacements (V, 3) of every vertex for itself."""
+    """Return the displacements (V, 3) unchanged."""
     return displacement_m
 
 
 def frame_surfaces(
     avatar: Avatar, clothed: BodyFit, settle: Callable[[np.ndarray], np.ndarray] = as_they_are
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the skinned surface of `clothed`, moved onto the avatar's zero surface in each frame, (n, V, 3) float32 in
-    the world, and the displacements (n, V, 3) in the rest pose that skinning takes there.
+    """Move the skinned surface of `clothed` onto the avatar's zero surface in each frame. Return these surfaces, (n, V,
+    3) float32 in the world, and the displacements (n, V, 3) in the rest pose from which skinning produces them.
 
-    settle: makes displacements (V, 3) in the rest pose agree with each other.
+    settle: smooths the displacements (V, 3) of one frame in the rest pose.
     """
     rig, device = clothed.rig, avatar.body.theta.device
     learned_m = avatar.frame_displacements(rig.vertices_m.to(device), clothed.theta.to(device), clothed.root.to(device))
@@ -57,11 +58,11 @@ def frame_surfaces(
 
 
 def correctives_of(displacements_m: np.ndarray, count: int) -> Correctives:
-    """Return shapes that rebuild the `count` components that together leave the least squared displacement (n, V, 3),
-    and their weights, which are from 0 to 1, since Blender and others clamp them to that.
+    """Return shapes and weights that reproduce displacements (n, V, 3) by the `count` components that leave the least
+    squared error. Weights are from 0 to 1, since Blender and others clamp them to that range.
 
     Components are the leading terms of the singular value decomposition (Eckart and Young 1936). It is not centred, so
-    that frames without displacements have no weights.
+    that frames without displacements have zero weights.
     """
     frames = displacements_m.reshape(len(displacements_m), -1)
     count = min(count, len(frames))
@@ -74,8 +75,8 @@ def _without_negative_weights(weights: np.ndarray, shapes_m: np.ndarray) -> tupl
     """Return weights (n, K + 1) from 0 to 1 and shapes (K + 1, M) with the same products as weights (n, K) of any sign
     and shapes (K, M).
 
-    With shapes scaled to weights of at most 1, one more shape, minus the sum of all, allows to raise all weights of a
-    frame alike until none is negative.
+    Shapes are scaled so that weights are at most 1. One more shape, minus the sum of all, then allows all weights of a
+    frame to be raised equally until none is negative.
     """
     if not shapes_m.size:
         return weights, shapes_m

@@ -1,4 +1,4 @@
-"""A light as a dome around the scene: a picture of its radiance by longitude and latitude, for UsdLuxDomeLight."""
+"""A light as a dome around the scene: an image of its radiance by longitude and latitude, for UsdLuxDomeLight."""
 
 import numpy as np
 from scipy.optimize import nnls
@@ -6,15 +6,15 @@ from scipy.optimize import nnls
 from hnerf.asset.light import REFLECTED, Light, harmonics
 from hnerf.asset.srgb import to_srgb
 
-HEIGHT_PX = 16  # of a picture twice as wide: a light of order 2 has no detail
-SMOOTHNESS = 1e-3  # weight of the radiance's square against the light's coefficients
+HEIGHT_PX = 16  # of an image twice as wide: a light of order 2 has no detail
+SMOOTHNESS = 1e-3  # weight of the squared radiance relative to the error of the light's coefficients
 
 
 def dome(light: Light) -> tuple[np.ndarray, float]:
-    """Return a picture (H, 2 H, 3) uint8 sRGB and the intensity that it is multiplied by in linear light.
+    """Return an image (H, 2 H, 3) uint8 sRGB and the intensity that it is multiplied by in linear light.
 
-    The radiance of order 2 that gives a light's irradiance may be negative. This is the least radiance that is not, and
-    has nearly the same irradiance everywhere (non-negative least squares, Lawson and Hanson 1974).
+    The radiance of order 2 that gives a light's irradiance may be negative. The image shows the least non-negative
+    radiance that has nearly the same irradiance everywhere (non-negative least squares, Lawson and Hanson 1974).
     """
     directions, share = dome_directions(HEIGHT_PX)
     gives = (harmonics(directions) * share[:, None]).T  # coefficients of a radiance
@@ -28,10 +28,10 @@ def dome(light: Light) -> tuple[np.ndarray, float]:
 
 
 def dome_directions(height_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the directions (N, 3), Y up, of the pixels of a picture twice as wide, row by row, and each one's share of
-    the sphere (N,).
+    """Return the directions (N, 3), Y up, of the pixels of an image twice as wide as high, row by row, and the share of
+    the sphere (N,) that each pixel covers.
 
-    The middle column looks along +Z, and a quarter of the width to its left is +X, as OpenEXR has latlong maps.
+    The middle column looks along +Z, and a quarter of the width to its left is +X, as in OpenEXR's latlong maps.
     """
     latitude = np.pi * (0.5 - (np.arange(height_px) + 0.5) / height_px)
     longitude = np.pi * (1 - (np.arange(2 * height_px) + 0.5) / height_px)

@@ -49,8 +49,8 @@ log = logging.getLogger("hnerf.asset")
 
 @dataclass(frozen=True)
 class RestMeshes:
-    """The field's surface in the rest pose, `dense`; the meshes made of it by topology, and how far they are from it as
-    registered or decimated."""
+    """Meshes in the rest pose. dense: the field's surface; by_topology: the meshes made from it; distances_mm: how far
+    these are from it after registration or decimation."""
 
     dense: trimesh.Trimesh
     by_topology: dict[str, AssetMesh]
@@ -59,9 +59,9 @@ class RestMeshes:
 
 @dataclass(frozen=True)
 class ClothedSurface:
-    """The surface of the asset: the mesh, moved by the mean displacement of the training frames, the body in every
-    frame, its surface in the world, (n, V, 3), what displacements (n, V, 3) take skinning there, and the blend shapes
-    that come close to them."""
+    """The surface of the asset. mesh: moved by the mean displacement of the training frames; body: in every frame;
+    surfaces_m (n, V, 3): in the world; displacements_m (n, V, 3): those from which skinning produces these surfaces;
+    correctives: blend shapes that approximate the displacements."""
 
     mesh: AssetMesh
     body: BodyFit
@@ -72,8 +72,8 @@ class ClothedSurface:
 
 @dataclass(frozen=True)
 class MeshAsset:
-    """All that is written of one mesh, its views beside the field's with their figures, and the seconds of each
-    step."""
+    """The asset of one mesh: what is written of it, its views next to the field's with their figures, and the seconds
+    of each step."""
 
     surface: ClothedSurface
     staged: StagedAvatar
@@ -83,7 +83,7 @@ class MeshAsset:
     seconds: dict[str, float]
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # more threads round sums differently, and give other bytes
+@threadpool_limits.wrap(limits=1, user_api="blas")  # with more threads, sums round differently and bytes change
 def export_asset(
     capture: Capture,
     masks: Masks,
@@ -93,14 +93,14 @@ def export_asset(
     digest: str = "",
     further: Mapping[str, Motion] | None = None,
 ) -> dict[str, Any]:
-    """Write the files that docs/asset.md lists into `out`; returns what `report.json` holds.
+    """Write the files that docs/asset.md lists into `out`; return the content of `report.json`.
 
-    digest: of the recording, for the asset's information; further: motions by other bodies to add, by name. Raises
-    InputError if the field has no surface or a motion lacks a joint, InvalidAsset if a package does not pass
-    validation, or the asset is far below its field (`require_close`).
+    digest: of the recording, for the asset's information; further: motions of other bodies to add, by name. Raises
+    InputError if the field has no surface or a motion lacks a joint, and InvalidAsset if a package fails validation or
+    the asset is far below its field (`require_close`).
     """
     seconds: dict[str, float] = {}
-    own = avatar.without_frames().body.to("cpu")  # the unclothed body, beside which further motions are put
+    own = avatar.without_frames().body.to("cpu")  # the unclothed body, to which further motions are retargeted
     added = {
         name: (retarget(own, motion, capture.up, f"motion {name}"), motion.fps)
         for name, motion in (further or {}).items()
@@ -143,7 +143,7 @@ def export_asset(
 
 
 def _rest_meshes(avatar: Avatar, settings: AssetSettings, seconds: dict[str, float]) -> RestMeshes:
-    """Mesh the avatar in the rest pose; seconds: where steps' times go."""
+    """Mesh the avatar in the rest pose. seconds: receives the time of each step."""
     timeless = avatar.without_frames()  # one mesh serves all frames
     with _timed("surface", seconds):
         rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
@@ -164,8 +164,8 @@ def _mesh_asset(
     settings: AssetSettings,
     added: Mapping[str, tuple[BodyFit, float]],
 ) -> MeshAsset:
-    """Texture, rig and move one of the meshes, and compare it with the field; InvalidAsset if it is far below. added:
-    further motions on the unclothed body, with their frames a second, by name."""
+    """Texture, rig and animate one of the meshes, and compare it with the field. Raises InvalidAsset if it is far
+    below. added: further motions of the unclothed body with their frame rates, by name."""
     seconds: dict[str, float] = {}
     timeless = avatar.without_frames()  # one texture serves all frames
     with _timed("correctives", seconds):
@@ -204,7 +204,7 @@ def _mesh_asset(
 
 
 def _clothed_surface(capture: Capture, avatar: Avatar, mesh: AssetMesh, settings: AssetSettings) -> ClothedSurface:
-    """Follow a mesh in the rest pose through the frames."""
+    """Track a rest-pose mesh through the frames."""
     poses = select_poses(avatar.without_frames().body, capture.frames).to("cpu")
     body = dataclasses.replace(poses, rig=mesh.rig)
     surfaces_m, displacements_m = frame_surfaces(avatar, body, mesh.settle)
@@ -242,7 +242,7 @@ def _figures(
 
 
 def _captured_figures(asset: MeshAsset) -> dict[str, Any]:
-    """Return the figures of the captured mesh beside the registered one."""
+    """Return the figures of the captured mesh, which are reported next to the registered one's."""
     return {
         "mesh": mesh_figures("captured", asset.surface.mesh, asset.staged),
         "levels": level_figures(asset.staged),
@@ -253,8 +253,8 @@ def _captured_figures(asset: MeshAsset) -> dict[str, Any]:
 
 
 def write_files(out: Path, avatars: Avatars, capture: Capture, info: AssetInfo, splats: Splats | None) -> None:
-    """Write a staged avatar in all formats into the folder `out`, of which USD has the meshes of all topologies, others
-    the first; splats: on its surface, for files of their own."""
+    """Write a staged avatar in all formats into the folder `out`. USD files with variants contain the meshes of all
+    topologies, other files only the first. splats: on its surface, written to separate files."""
     cameras, staged = list(capture.cameras.values()), next(iter(avatars.values()))
     write_package(out, avatars, cameras, capture.fps, info)
     write_usdz(out / "avatar.usdz", avatars, cameras, capture.fps, info)

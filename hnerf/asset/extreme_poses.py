@@ -1,4 +1,4 @@
-"""What shows how an asset bends: extreme poses, expressions, and other physiques."""
+"""Shapes that show how well an asset deforms: extreme poses, expressions, and other physiques."""
 
 import math
 from collections.abc import Mapping
@@ -19,14 +19,14 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.hand_points import finger_joints
 from hnerf.body.rig import Rig
 
-# Turns of joints from the A pose, about X to the left, then Y up, then Z to the front, in degrees; the right side
-# mirrors the left. Near the ends of what people can do.
+# Joint rotations from the A pose, in degrees: about X (to the left), then Y (up), then Z (to the front). The right side
+# mirrors the left. They are near the limits of human motion.
 ARMS_UP = {"clavicle.L": (0, 0, 20), "upperarm01.L": (0, 0, 100)}
 DEEP_SQUAT = {"spine05": (20, 0, 0), "spine03": (10, 0, 0), "upperleg01.L": (-110, 20, 0), "lowerleg01.L": (130, 0, 0),
               "foot.L": (-25, 0, 0), "upperarm01.L": (-40, 0, 0)}  # fmt: skip
 TURNED_HEAD = {"neck01": (0, 20, 0), "neck02": (0, 15, 0), "neck03": (0, 15, 0), "head": (0, 20, 0)}
 FIST_DEG = (20.0, 35.0, 45.0, *4 * (80.0, 95.0, 60.0))  # flexion of segments from straight: the thumb's, then fingers'
-HAND = ("wrist.L", "metacarpal", "finger")  # beginnings of the names of joints
+HAND = ("wrist.L", "metacarpal", "finger")  # prefixes of joint names
 HEAD = ("head", "neck", "eye")
 EXPRESSIONS = {
     "Jaw open": ("jawOpen",),
@@ -39,7 +39,7 @@ EXPRESSIONS = {
 @dataclass(frozen=True)
 class ExtremePose:
     """A pose of the asset, or its rest pose in another shape. points_m (V, 3), Y up, facing +Z; shown (V,) bool: the
-    points that a picture frames; crossing: the share of the skin's faces that cross others."""
+    points that an image frames; crossing: the share of the skin's faces that cross others."""
 
     name: str
     points_m: np.ndarray
@@ -48,7 +48,7 @@ class ExtremePose:
 
 
 def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[ExtremePose]:
-    """Return the poses that a body has joints for, and the expressions and physiques that it has. rig: the asset's, in
+    """Return the poses for which the rig has joints, and the asset's expressions and physiques. rig: the asset's, in
     body axes; skin_faces: how many of its first faces are closed skin."""
     everything = np.ones(len(rig.vertices_m), bool)
     poses = {
@@ -68,8 +68,8 @@ def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[Extre
 
 
 def with_expressions(staged: StagedAvatar) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return the surface at rest (V, 3) with each of `EXPRESSIONS`, and the points (V,) bool of the face, by name;
-    nothing if the asset has no expressions."""
+    """Return, by name, the surface at rest (V, 3) with each of `EXPRESSIONS`, and which points belong to the face, (V,)
+    bool. Empty if the asset has no expressions."""
     units = staged.expressions_m
     if not units:
         return {}
@@ -79,7 +79,8 @@ def with_expressions(staged: StagedAvatar) -> dict[str, tuple[np.ndarray, np.nda
 
 
 def turned(rig: Rig, turns_deg: Mapping[str, tuple[float, float, float]]) -> Tensor | None:
-    """Return the pose (J, 3), axis-angle in body axes, of turns in stage axes; None if the rig lacks a joint."""
+    """Return the pose (J, 3), axis-angle in body axes, of rotations in stage axes, mirrored to the right side; None if
+    the rig lacks a joint."""
     mirrored = {f"{name[:-1]}R": (x, -y, -z) for name, (x, y, z) in turns_deg.items() if name.endswith(".L")}
     both = {**turns_deg, **mirrored}
     if not set(both) <= set(rig.joint_names):
@@ -104,7 +105,7 @@ def fist(rig: Rig) -> Tensor | None:
 
 
 def moved_by(rig: Rig, names: tuple[str, ...]) -> np.ndarray:
-    """Return which vertices (V,) follow most a joint whose name begins with one of these, bool."""
+    """Return which vertices (V,) bool have their largest weight on a joint whose name starts with one of `names`."""
     joints = [j for j, joint in enumerate(rig.joint_names) if joint.startswith(names)]
     most = rig.skin_joints.gather(1, rig.skin_weights.argmax(1, keepdim=True))[:, 0]
     return np.isin(most.numpy(), joints)

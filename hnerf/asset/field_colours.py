@@ -1,5 +1,5 @@
-"""The field's colour of each texel; where the field shows nothing, such as a finger that it lacks, that of the skin
-around."""
+"""The field's colour at each texel. Where the field has no surface, such as on a finger that it lacks, the colour of
+the skin around."""
 
 import logging
 
@@ -16,9 +16,9 @@ from hnerf.avatar.surface import move_onto_surface
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
 
-OFF_SURFACE_M = 0.005  # farther from the field's surface, its colour was not seen by any camera
-PINNED = 1e3  # weight of a known colour against the Laplacian's, which are about 1
-LOOSE = 1e-9  # of the mean colour, for parts without any known one
+OFF_SURFACE_M = 0.005  # farther from the field's surface, no camera has seen the field's colour
+PINNED = 1e3  # weight of a known colour; the Laplacian's weights are about 1
+LOOSE = 1e-9  # weight of the mean colour, for parts where no colour is known
 
 log = logging.getLogger("hnerf.asset")
 
@@ -30,7 +30,7 @@ def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels, cavities: np
 
     Poses of the capture keep the field's conditioning within what it was trained on; the median rejects a pose in which
     that spot touches another limb. A texel that lies off the field's surface in all poses takes the colour of the mesh
-    around it, and so do vertices that line cavities, (V,) bool, of which the field has no surface.
+    around it. So do the cavities (V,) bool, where the field has no surface.
     """
     seen, outer = [], ~torch.from_numpy(cavities)
     for frame, theta, root in zip(clothed.frames, clothed.theta, clothed.root, strict=True):
@@ -40,7 +40,7 @@ def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels, cavities: np
 
 
 def median_of_seen(colours: np.ndarray) -> np.ndarray:
-    """Return the median over poses of colours (P, N, 3), without those that are not a number; NaN where all are."""
+    """Return the median over poses of colours (P, N, 3), ignoring NaN; NaN if all are NaN."""
     ordered = np.sort(colours, axis=0)  # NaN last
     seen = (~np.isnan(colours[..., 0])).sum(0)
     row = np.arange(len(seen))
@@ -49,8 +49,8 @@ def median_of_seen(colours: np.ndarray) -> np.ndarray:
 
 
 def filled(colours: np.ndarray, texels: Texels, rig: Rig) -> np.ndarray:
-    """Return colours (N, 3) with those that are not a number replaced: known ones, taken to the vertices of the mesh,
-    spread over it harmonically (lap c = 0)."""
+    """Return colours (N, 3) with NaN replaced: known colours are averaged at the mesh's vertices and spread over it
+    harmonically (lap c = 0)."""
     unknown = np.isnan(colours[:, 0])
     if not unknown.any() or unknown.all():
         return np.nan_to_num(colours)
@@ -70,7 +70,7 @@ def filled(colours: np.ndarray, texels: Texels, rig: Rig) -> np.ndarray:
 
 def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, root: Tensor, outer: Tensor) -> Tensor:
     """Return the radiance at each texel of the surface posed by theta (J, 3) and root (4, 4), (N, 3) on the CPU; NaN
-    off the field's surface, and on faces that touch a vertex that is not outer (V,)."""
+    off the field's surface, and on faces with a vertex that is not `outer` (V,)."""
     device = avatar.body.rig.vertices_m.device
     vertices_m, faces = pose_vertices(rig, theta, root).to(device), rig.faces.to(device)
     theta, root = theta.to(device), root.to(device)

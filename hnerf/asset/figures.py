@@ -16,11 +16,11 @@ from hnerf.asset.staging import CAPTURED, StagedAvatar
 from hnerf.asset.topologies import AssetMesh
 from hnerf.geometry.mesh_queries import Surface
 
-SAMPLES = 20_000  # of a level of detail
+SAMPLES = 20_000  # points on each mesh
 
 
 def mesh_figures(topology: str, mesh: AssetMesh, staged: StagedAvatar) -> dict[str, Any]:
-    """Return the size of the asset's mesh, of a topology by name, and how many faces of its skin cross others."""
+    """Return the size of the asset's mesh, and how many faces of its skin cross others. topology: its name."""
     skin = mesh.trimesh.faces[: mesh.skin_faces]
     return {
         "topology": topology,
@@ -33,8 +33,8 @@ def mesh_figures(topology: str, mesh: AssetMesh, staged: StagedAvatar) -> dict[s
 
 
 def level_figures(staged: StagedAvatar) -> dict[str, dict[str, float]]:
-    """Return the size of each level of detail, and the distance between its surface at rest and that of lod0, from
-    points on either: on average, and what 99 % of it stay below."""
+    """Return the size of each level of detail, and the mean and the 99th percentile of the distance between its surface
+    at rest and that of lod0, sampled on both."""
     meshes = [trimesh.Trimesh(staged.rest_points_m[lv.vertices], lv.faces, process=False) for lv in staged.levels]
     found: dict[str, dict[str, float]] = {}
     for level, mesh in enumerate(meshes):
@@ -53,8 +53,8 @@ def _distances_m(mesh: trimesh.Trimesh, other: trimesh.Trimesh) -> np.ndarray:
 
 
 def rig_figures(staged: StagedAvatar, name: str) -> dict[str, float]:
-    """Return a rig's size, and how far it moves the captured surfaces from where the full rig has them: what 99 % of
-    the points stay below in all frames, and the furthest."""
+    """Return a rig's size, and how far it moves points of the captured surfaces from where the full rig has them: the
+    99th percentile and the maximum over points, each in its worst frame."""
     rig, full = staged.rigs[name], staged.rigs[FULL]
     surfaces = [] if rig is full else [one.surfaces_m(CAPTURED, staged.rest) for one in (rig, full)]
     off_m = (moved - true for moved, true in zip(*surfaces, strict=True))
@@ -62,8 +62,8 @@ def rig_figures(staged: StagedAvatar, name: str) -> dict[str, float]:
 
 
 def splat_figures(staged: StagedAvatar, splats: Splats) -> dict[str, float]:
-    """Return how many splats there are, their sigma along the surface, and how far their own skin moves them from the
-    captured surfaces, as `rig_figures` does."""
+    """Return the number of splats, their sigma along the surface, and how far their own skin moves them from the
+    captured surfaces, as in `rig_figures`."""
     game, full = staged.rigs[GAME], staged.rigs[FULL]
     skin, weights = splats.skin(game), game.motions[CAPTURED].shape_weights
     poses = posed_frames(game.skeleton, game.stage[CAPTURED], staged.rest, weights)
@@ -75,13 +75,13 @@ def splat_figures(staged: StagedAvatar, splats: Splats) -> dict[str, float]:
 
 
 def _moved_mm(off_m: Iterable[np.ndarray]) -> dict[str, float]:
-    """Return what 99 % of points stay below in all frames, and the furthest; off_m: (V, 3) of each frame."""
+    """Return the 99th percentile and the maximum over points, each in its worst frame. off_m: (V, 3) of each frame."""
     worst_m = reduce(np.maximum, (np.linalg.norm(m, axis=1) for m in off_m), np.zeros(1))
     return {"moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)), "moved_max_mm": float(1e3 * worst_m.max())}
 
 
 def beyond_skinning_mm(displacements_m: np.ndarray, correctives: Correctives) -> dict[str, float]:
-    """Return the root mean square distance of the frames' surfaces from the skinned one, without and with its
+    """Return the root mean square distance of the frames' surfaces from the skinned surface, without and with
     correctives."""
     rebuilt_m = np.einsum("nk,kvd->nvd", correctives.weights, correctives.offsets_m)
     left_m = {"skinned": displacements_m, "with_correctives": displacements_m - rebuilt_m}

@@ -16,10 +16,10 @@ from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
-RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # glTF counts in seconds and does not need them
+RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # left out: glTF times are in seconds
 VARIANTS = "KHR_materials_variants"
-DENSE_SHARE = 0.75  # of the vertices; if a blend shape moves more, indices of 4 bytes cost more than zeros of 12
-STILL = 1e-6  # metres or radians by which a joint without a channel may be off
+DENSE_SHARE = 0.75  # of the vertices; if a blend shape moves more, 4-byte indices cost more than 12-byte zeros
+STILL = 1e-6  # metres or radians; a joint that moves less gets no channel
 SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
 
 
@@ -55,8 +55,8 @@ class GlbWriter:
         return len(self.document.accessors) - 1
 
     def sparse_accessor(self, values: np.ndarray, at: int, count: int) -> int:
-        """Append an array of `count` elements that are zero but for float32 values (n, C) at n < count of them; return
-        the index of the accessor. at: the view of their indices, uint32 in rising order."""
+        """Append an array of `count` elements that are zero except for n < count float32 values (n, C); return the
+        index of the accessor. at: the buffer view of their indices, uint32 in ascending order."""
         sparse = gltf.Sparse(
             count=len(values),
             indices=gltf.AccessorSparseIndices(bufferView=at, componentType=gltf.UNSIGNED_INT),
@@ -83,8 +83,8 @@ class GlbWriter:
 
 
 def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
-    """Write a rig of the avatar with all its motions but the captured one at other rates: joints are nodes 0 to J-1,
-    the mesh is node J; time 0 is a motion's first instant."""
+    """Write a rig of the avatar with all its motions except the resampled ones. Joints are nodes 0 to J-1, the mesh is
+    node J; time 0 is a motion's first instant."""
     writer = GlbWriter()
     document = writer.document
     _add_joints(document, rig.skeleton)
@@ -140,7 +140,7 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Prim
 
 
 def _target(writer: GlbWriter, offsets_m: np.ndarray, normal_changes: np.ndarray) -> gltf.Attributes:
-    """Add what a blend shape changes at the vertices, two (V, 3)."""
+    """Add a blend shape: its offsets and its changes of normals, both (V, 3)."""
     changes = offsets_m.astype(np.float32), normal_changes.astype(np.float32)
     moved = moved_points(offsets_m)
     if len(moved) > DENSE_SHARE * len(offsets_m):
@@ -156,7 +156,7 @@ def _vertex_data(writer: GlbWriter, values: np.ndarray, dtype: type) -> int:
 
 
 def _add_materials(writer: GlbWriter, avatar: StagedAvatar, primitive: gltf.Primitive) -> None:
-    """Add the captured look, which the primitive has, and the albedo, if there is one, as another variant of it."""
+    """Add the captured look, which the primitive uses, and, if there is an albedo, a material variant for it."""
     document = writer.document
     document.samplers.append(gltf.Sampler(wrapS=gltf.CLAMP_TO_EDGE, wrapT=gltf.CLAMP_TO_EDGE))
     looks = {"captured": avatar.texture} | ({"albedo": avatar.albedo.texture} if avatar.albedo else {})
@@ -184,8 +184,8 @@ def _add_texture(writer: GlbWriter, image: np.ndarray) -> int:
 
 
 def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton, shapes: int) -> gltf.Animation:
-    """Add what moves: translations and rotations of joints that leave their place at rest, and the weights of the
-    correctives; those of expressions, which follow them up to a number of shapes, are 0."""
+    """Add channels for what moves: joints that leave their transform at rest, and the weights of the correctives. The
+    expressions and physiques that follow the correctives, up to `shapes` in all, have weight 0."""
     animation = gltf.Animation(name=name, channels=[], samplers=[])
     times = writer.accessor(((motion.codes - motion.codes[0]) / motion.fps).astype(np.float32))
 

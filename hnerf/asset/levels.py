@@ -11,15 +11,15 @@ import trimesh
 from hnerf.asset.simplify import collapse_edges
 from hnerf.asset.texture import UvLayout
 
-FACES_PER_SEAM_EDGE = 1.5  # at least: with fewer, charts whose seams are kept get broken
+FACES_PER_SEAM_EDGE = 1.5  # at least: with fewer faces, charts break, since their seams are kept
 
 log = logging.getLogger("hnerf.asset")
 
 
 @dataclass(frozen=True)
 class Level:
-    """A mesh on some or all of the avatar's vertices. vertices (W,): their indices, by which it has their skin, blend
-    shapes and normals; faces (F, 3): of these W; layout: texture coordinates of the faces' corners."""
+    """A mesh on some or all of the avatar's vertices. vertices (W,): their indices, from which it takes their skin,
+    blend shapes and normals; faces (F, 3): indices into these W; layout: texture coordinates of the faces' corners."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -27,9 +27,9 @@ class Level:
 
 
 def levels_of(points_m: np.ndarray, faces: np.ndarray, layout: UvLayout, face_counts: Sequence[int]) -> list[Level]:
-    """Return a mesh (V, 3), (F, 3) and its decimations to each count of triangles, largest first. Left out are counts
-    that the mesh does not exceed, and, with a warning, those so small that the seams of the charts would hardly leave
-    anything between them."""
+    """Return a mesh (V, 3), (F, 3) and its decimations to each count of triangles, largest first. Counts that the mesh
+    does not exceed are left out. So are, with a warning, counts so small that hardly any faces would be left between
+    the charts' seams."""
     whole, seams = Level(np.arange(len(points_m)), faces, layout), len(seam_edges(layout.face_uvs))
     found = [whole]
     for count in sorted({count for count in face_counts if count < len(faces)}, reverse=True):
@@ -43,14 +43,14 @@ def levels_of(points_m: np.ndarray, faces: np.ndarray, layout: UvLayout, face_co
 
 
 def seam_edges(face_uvs: np.ndarray) -> np.ndarray:
-    """Return the edges (n, 2) of faces (F, 3), as rows of texture coordinates, at which charts end."""
+    """Return the edges (n, 2) at which the charts of faces (F, 3) end, as rows of texture coordinates."""
     edges = np.sort(trimesh.geometry.faces_to_edges(face_uvs), axis=1)
     return edges[trimesh.grouping.group_rows(edges, require_count=1)]
 
 
 def _decimated(points_m: np.ndarray, whole: Level, face_count: int) -> Level:
-    """Return the mesh after collapses of edges to one of their ends. The seams of the charts are
-    kept as they are: the mesh is cut open there, and its parts fit together again."""
+    """Return the mesh decimated by collapsing edges to one of their ends. The charts' seams are kept: the mesh is cut
+    open along them, and its parts still fit together afterwards."""
     uvs, face_uvs = np.unique(whole.layout.face_uvs, return_inverse=True)
     face_uvs = face_uvs.reshape(-1, 3)
     vertex_of_uv = np.zeros(len(uvs), np.int64)

@@ -1,4 +1,4 @@
-"""The light of a recording, estimated from how the colours of points follow their normals.
+"""The light of a recording, estimated from how the colours of points vary with their normals.
 
 The light is grey, far away and casts no shadow, and its radiance is L(w) = sum_k l_k Y_k(w) / Y_0, in real spherical
 harmonics to order 2. A matte point of albedo a and normal n then has, in linear light, the colour
@@ -6,8 +6,8 @@ harmonics to order 2. A matte point of albedo a and normal n then has, in linear
     a E(n),  E(n) = sum_k A_k l_k Y_k(n) / Y_0,  A = 1, 2/3, 1/4 in orders 0, 1, 2
 
 (Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps"; irradiance is pi E).
-Albedo and light are known but for a factor. Here E is 1 at the brightest normal that was seen: what faces the light
-keeps the colour that it was photographed with, and no albedo is above 1 but where photographs are overexposed.
+Albedo and light are known only up to a common factor. Here E is 1 at the brightest normal that was seen: points that
+face the light keep their photographed colour, and albedos exceed 1 only where photographs are overexposed.
 """
 
 from collections.abc import Callable
@@ -18,9 +18,9 @@ from scipy.sparse import csr_array
 
 ORDER = np.repeat([0, 1, 2], [1, 3, 5])
 REFLECTED = np.array([1, 2 / 3, 1 / 4])[ORDER]  # A
-LEAST_IRRADIANCE = 0.1  # of the greatest: darker, neither photographs nor the estimate say much
-OUTLIER = 0.5  # of the expected colour: what differs more is another surface
-RIDGE = 1e-5  # of the evidence: where the normals of points turn by less than a quarter of a degree, it decides
+LEAST_IRRADIANCE = 0.1  # of the greatest: below this, neither photographs nor the estimate say much
+OUTLIER = 0.5  # relative to the expected colour: what differs more is another surface
+RIDGE = 1e-5  # relative to the evidence: it decides where the normals of points turn by less than a quarter of a degree
 ITERATIONS, SETTLED = 30, 1e-4
 
 Sums = Callable[[np.ndarray], np.ndarray]
@@ -28,8 +28,8 @@ Sums = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Shading:
-    """Colours of points with various normals: point (M,) from 0, normals (M, 3), colours (M, 3) in linear light,
-    weights (M,)."""
+    """Colours of points seen at various normals. point (M,): the point's number, from 0; normals (M, 3); colours (M, 3)
+    in linear light; weights (M,)."""
 
     point: np.ndarray
     normals: np.ndarray
@@ -39,8 +39,8 @@ class Shading:
 
 @dataclass(frozen=True)
 class Light:
-    """A light. coefficients (9,): l; turn_deg: by how much the normals of single points turned, as root mean square:
-    near 0, nothing is known of it but that it is taken to be the same from everywhere."""
+    """A light. coefficients (9,): l; turn_deg: the root mean square angle by which the normals of single points turned.
+    If it is near 0, the light is unknown and assumed to be the same from all directions."""
 
     coefficients: np.ndarray
     turn_deg: float
@@ -50,7 +50,7 @@ class Light:
         return (harmonics(normals) @ (REFLECTED * self.coefficients)).clip(LEAST_IRRADIANCE)
 
     def turned(self, rotation: np.ndarray) -> "Light":
-        """Return the same light in other axes; rotation (3, 3): to them from these."""
+        """Return the same light in other axes. rotation (3, 3): from the current axes to the new ones."""
         directions = np.random.default_rng(0).normal(size=(100, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         radiance = harmonics(directions) @ self.coefficients
@@ -66,12 +66,13 @@ def harmonics(directions: np.ndarray) -> np.ndarray:
 
 
 def fit_light(shading: Shading) -> Light:
-    """Return the light that best explains the colours by one albedo a point.
+    """Return the light that best explains the colours with one albedo per point.
 
-    Least squares of colours relative to the expected ones, each weighted by its expected brightness, as the noise of
-    photographs asks, and less the worse it fits (Geman-McClure). In turns, an albedo is the ratio of its colours to
-    their irradiances, and the light takes a Gauss-Newton step in which the albedos follow (variable projection, Golub
-    and Pereyra 1973). A ridge keeps the light constant where the normals of points do not turn.
+    This is least squares on colours relative to the expected ones. Each colour is weighted by its expected brightness,
+    to match the noise of photographs, and less the worse it fits (Geman-McClure). Two steps alternate: each albedo
+    becomes the ratio of its colours to their irradiances, and the light takes a Gauss-Newton step in which the albedos
+    follow (variable projection, Golub and Pereyra 1973). A ridge keeps the light uniform where the normals of points do
+    not turn.
     """
     coefficients = np.eye(len(REFLECTED))[0]
     if not len(shading.point):
@@ -98,8 +99,8 @@ def fit_light(shading: Shading) -> Light:
 def _step(
     sums: Sums, weight: np.ndarray, slope: np.ndarray, residual: np.ndarray, coefficients: np.ndarray
 ) -> np.ndarray:
-    """Return the change (9,) of coefficients that takes most of residuals (M,) of these weights (M,) and slopes (M, 9),
-    where each point may be brighter or darker as a whole; the constant one stays."""
+    """Return the change (9,) of the coefficients that best reduces residuals (M,) with weights (M,) and slopes (M, 9),
+    if each point may become brighter or darker as a whole. The constant coefficient stays."""
     both = np.column_stack([slope[:, 1:], residual])
     both -= sums(weight[:, None] * both) / sums(weight).clip(1e-12)[:, None]
     squares = both.T @ (weight[:, None] * both) / weight.sum()
@@ -109,6 +110,6 @@ def _step(
 
 
 def _sums_over(point: np.ndarray) -> Sums:
-    """Return the function that takes values (M, ...) to the sums (M, ...) over all that was seen of the same point."""
+    """Return a function that maps values (M, ...) to their sums (M, ...) over all observations of the same point."""
     of_point = csr_array((np.ones(len(point)), (point, np.arange(len(point)))))
     return lambda values: (of_point @ values)[point]

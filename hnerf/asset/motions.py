@@ -10,15 +10,15 @@ from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 from hnerf.geometry.rotations import slerp
 
-LEAST_TWIST = 0.5  # length of the twist's part of a quaternion: cos(60), where the up axis swings by 120 degrees
+LEAST_TWIST = 0.5  # length of a quaternion's twist part: cos(60), when the up axis swings by 120 degrees
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Poses of the body model at instants, in stage axes. fps: of the time codes; codes (n,): times fps is seconds.
+    """Poses of the body model at instants, in stage axes. fps: of the time codes; codes (n,): seconds times fps.
 
-    turns (n, S, 3, 3): each joint relative to its parent, where orientations at rest are the identity; origins_m (n,
-    3): where the first joint is; shape_weights (n, K): of corrective blend shapes.
+    turns (n, S, 3, 3): rotation of each joint relative to its parent; orientations at rest are the identity; origins_m
+    (n, 3): position of the first joint; shape_weights (n, K): of corrective blend shapes.
     """
 
     fps: float
@@ -44,10 +44,10 @@ class Motion:
 
 
 def motion_of(body: BodyFit, fps: float, shape_weights: np.ndarray, stage_from_world: np.ndarray) -> Motion:
-    """Return the motion of a body, its frames as time codes.
+    """Return the motion of a body, with its frame numbers as time codes.
 
-    The body frame is Z up whatever the world is. With W stage from world, B stage from body and T world from body, the
-    first joint turns by W T R B^-1, and the others by B R B^-1.
+    The body frame is Z up, whatever the world's axes. With W stage from world, B stage from body and T world from body,
+    the first joint turns by W T R B^-1, and the others by B R B^-1.
     """
     root, theta = body.root.double(), body.theta.double()
     turns = Y_UP_FROM_Z_UP @ rotation_from_axis_angle(theta).numpy() @ Y_UP_FROM_Z_UP.T
@@ -57,7 +57,7 @@ def motion_of(body: BodyFit, fps: float, shape_weights: np.ndarray, stage_from_w
 
 
 def resampled(motion: Motion, fps: float) -> Motion:
-    """Return the motion at the whole time codes of another rate that lie within it; at least one, the nearest.
+    """Return the motion at all whole time codes of another rate within its range; if there is none, at the nearest.
 
     Rotations are interpolated at constant angular velocity, positions and weights linearly.
     """
@@ -80,10 +80,11 @@ def resampled(motion: Motion, fps: float) -> Motion:
 
 
 def ground_transforms(pelvis: np.ndarray, floor_m: float) -> np.ndarray:
-    """Return the root's transforms (n, 4, 4): on the floor below the pelvis (n, 4, 4), turned as it about the vertical.
+    """Return the root's transforms (n, 4, 4): on the floor below the pelvis (n, 4, 4), with the same heading.
 
-    That turn is the twist of the pelvis' rotation from rest about Y (swing-twist decomposition, Dobrowolski 2015).
-    Upside down a pelvis has none, and in a somersault it turns full circle on the way: there it is interpolated.
+    The heading is the twist about Y of the pelvis' rotation from rest (swing-twist decomposition, Dobrowolski 2015). It
+    is undefined when the pelvis is upside down, and on the way there, in a somersault, it turns full circle. In such
+    poses it is interpolated.
     """
     _, y, _, w = Rotation.from_matrix(pelvis[:, :3, :3]).as_quat().T
     headings, known, rows = 2 * np.arctan2(y, w), np.hypot(y, w) >= LEAST_TWIST, np.arange(len(pelvis))
@@ -96,8 +97,8 @@ def ground_transforms(pelvis: np.ndarray, floor_m: float) -> np.ndarray:
 
 
 def continuous_quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Convert rotations (n, J, 3, 3) to quaternions (n, J, 4) as x y z w, each on the same hemisphere as in the frame
-    before."""
+    """Convert rotations (n, J, 3, 3) to quaternions (n, J, 4) as x y z w, each in the same hemisphere as in the
+    previous frame."""
     quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
     same_side = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) >= 0
     quaternions[1:] *= np.cumprod(np.where(same_side, 1, -1), axis=0)

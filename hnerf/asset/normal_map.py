@@ -12,16 +12,16 @@ from hnerf.avatar.surface import move_onto_surface, normals_and_distances
 from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig
 
-STEP_M = 0.002  # of differences of the signed distance
-OFF_SURFACE_M = 0.005  # from the field's surface, where its gradient means nothing for the mesh
+STEP_M = 0.002  # for finite differences of the signed distance
+OFF_SURFACE_M = 0.005  # farther from the field's surface, its gradient says nothing about the mesh
 
 
 def normal_map(avatar: Avatar, mesh: AssetMesh, layout: UvLayout, side_px: int) -> np.ndarray:
     """Return the normal map of a mesh in the rest pose, (side_px, side_px, 3) uint8, of components (n + 1) / 2 in the
-    frames of `tangents.py`: red along u, green along v (up), as glTF and USD have it.
+    frames of `tangents.py`: red along u, green along v (up), as in glTF and USD.
 
     It is flat on eyeballs and in cavities, where the mesh is off the field's surface, and where the field's gradient
-    and the mesh's normal disagree, as where fingers are one mitten in the field.
+    and the mesh's normal disagree, for example where the field merges the fingers into a mitten.
     """
     texels, rig = rasterise(layout, side_px), mesh.rig
     points_m, faces = rig.vertices_m.double().numpy(), rig.faces.numpy()

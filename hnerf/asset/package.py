@@ -1,12 +1,12 @@
-"""The USD files of an avatar, laid out as OpenUSD's guidelines for asset structure ask.
+"""The USD files of an avatar, laid out according to OpenUSD's guidelines for asset structure.
 
 `avatar.usda` is the interface: variant sets, asset information, and payloads that lie in `avatar/`. `avatar_24.usda`
-and `avatar_30.usda` show it at these rates, for importers that ignore a file's own. `avatar.usdz` has the same prims
-and variants in one layer, as ARKit asks. `avatar_cache.usdz` has the surface as points at every frame, and
-`avatar_splats.usdc`, if splats are wanted, has these.
+and `avatar_30.usda` show it at 24 and 30 frames a second, for importers that ignore a file's own rate. `avatar.usdz`
+has the same prims and variants in one layer, as ARKit requires. `avatar_cache.usdz` has the surface as points at every
+frame, and `avatar_splats.usdc` has the splats, if they are wanted.
 
-With a second avatar, of the captured mesh, there is a variant set `topology`. All other variant sets are inside its
-variants, and the names of payloads and pictures begin with the variant's.
+A second avatar, of the captured mesh, adds a variant set `topology`. All other variant sets are then inside its
+variants, and the names of payloads and images start with the variant's name.
 """
 
 import struct
@@ -52,14 +52,14 @@ from hnerf.geometry.camera import Camera
 FIRST_TIME = bytes([0, 0, 0x21, 0])  # midnight, 1 January 1980, in ZIP's time and date
 INTERFACE, PAYLOADS = "avatar.usda", "avatar"
 
-Variant = tuple[str, str]  # its set and its name there
-Avatars = dict[str, StagedAvatar]  # by topology; by "", without that variant set, if there is only one
+Variant = tuple[str, str]  # the variant set and the name in it
+Avatars = dict[str, StagedAvatar]  # by topology; if there is only one, by "" and without that variant set
 
 
 @dataclass(frozen=True)
 class AssetInfo:
-    """What the package says about itself. name: of the subject; version, licence: as the user gives them; capture: the
-    digest of the recording."""
+    """The package's metadata. name: of the subject; version, licence: as given by the user; capture: the digest of the
+    recording."""
 
     name: str
     version: str
@@ -70,7 +70,7 @@ class AssetInfo:
 @dataclass(frozen=True)
 class Part:
     """A part of the package. name: of its payload; author: defines its prims; fps: the rate of its layer's time codes;
-    variant: its set and its name there, if it is one; topology: likewise, which that is inside of."""
+    variant: the variant that it defines, if any; topology: the variant that contains this one, if any."""
 
     name: str
     author: Callable[[Usd.Stage], None]
@@ -130,7 +130,7 @@ def write_splats(path: Path, avatar: StagedAvatar, splats: Splats, fps: float, i
 
 
 def _prefix(topology: str) -> str:
-    """Return what names of payloads and pictures begin with."""
+    """Return the prefix of the names of payloads and images."""
     return f"{topology}_" if topology else ""
 
 
@@ -148,8 +148,8 @@ def _variant(topology: str) -> Variant | None:
 
 
 def _parts_of(avatar: StagedAvatar, cameras: list[Camera], fps: float, prefix: str) -> list[Part]:
-    """Return the parts of one topology; prefix: of its pictures. What one part says is stronger than what later ones
-    say: shapes replace the extents of motions."""
+    """Return the parts of one topology. prefix: of its images' names. Earlier parts override later ones: shapes replace
+    the extents of motions."""
     view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
     return [
         *(
@@ -179,7 +179,7 @@ def _parts_of(avatar: StagedAvatar, cameras: list[Camera], fps: float, prefix: s
 
 
 def _looks(avatar: StagedAvatar, fps: float, prefix: str) -> list[Part]:
-    """Return the look as captured, and, if there is one, that of the albedo with the light."""
+    """Return the captured look and, if there is an albedo, its look with the light."""
     meshes = surface_paths(avatar)
     author = partial(author_captured_look, meshes=meshes, avatar=avatar, prefix=prefix)
     looks = [Part("look_captured", author, fps, ("look", "captured"))]
@@ -204,7 +204,7 @@ def _in_variant(stage: Usd.Stage, variant: Variant | None) -> Iterator[None]:
 
 
 def _select(stage: Usd.Stage, avatars: Avatars, motion: str) -> None:
-    """Select what is shown at first: the first topology, and in each one the captured motion of the whole mesh."""
+    """Select the default variants: the first topology, and in each one the captured motion of the whole mesh."""
     sets = stage.GetDefaultPrim().GetVariantSets()
     for topology in reversed(avatars):
         with _in_variant(stage, _variant(topology)):
@@ -216,8 +216,8 @@ def _select(stage: Usd.Stage, avatars: Avatars, motion: str) -> None:
 
 
 def _write_interface(file: Path, parts: list[Part], avatars: Avatars, fps: float, info: AssetInfo, motion: str) -> None:
-    """Write an interface layer whose time codes have a rate, with that motion selected. It has payloads of its own:
-    time codes that are scaled twice are not whole, and importers that hold samples would be a frame late."""
+    """Write an interface layer with a rate of its time codes and with that motion selected. It refers to the payloads
+    directly: time codes that are scaled twice are not whole, and importers that hold samples would be a frame late."""
     stage = _new_stage(file, avatars, _time_range(avatars, motion, fps), fps, info)
     for part in parts:
         path = f"./{PAYLOADS}/{part.name}.usdc"
@@ -228,8 +228,8 @@ def _write_interface(file: Path, parts: list[Part], avatars: Avatars, fps: float
 
 
 def _time_range(avatars: Avatars, selected: str, fps: float) -> np.ndarray:
-    """Return the first and the last time code of a captured motion, (2,); the last of further motions where these last
-    longer, since a stage has one range for all of its variants."""
+    """Return the first and the last time code of a captured motion, (2,), extended to the end of further motions that
+    last longer, since a stage has one range for all of its variants."""
     motions = next(iter(avatars.values())).rigs[FULL].motions
     ends = [m.codes[-1] / m.fps * fps for name, m in motions.items() if not name.startswith(CAPTURED)]
     first, last = motions[selected].codes[[0, -1]]
@@ -237,7 +237,7 @@ def _time_range(avatars: Avatars, selected: str, fps: float) -> np.ndarray:
 
 
 def _new_stage(file: Path, avatars: Avatars, codes: np.ndarray, fps: float, info: AssetInfo) -> Usd.Stage:
-    """Return a stage from the first to the last of time codes, with the root prim and what it says of itself."""
+    """Return a stage from the first to the last of time codes, with the root prim and its metadata."""
     stage = Usd.Stage.CreateNew(str(file))
     _set_units(stage, fps)
     stage.SetStartTimeCode(float(codes[0]))
@@ -263,7 +263,8 @@ def _set_units(stage: Usd.Stage, fps: float) -> None:
 
 
 def _everywhere(avatar: StagedAvatar) -> np.ndarray:
-    """Return points (n, 3) whose box is around the surface at rest, in all motions and physiques, and in the cache."""
+    """Return points (n, 3) whose bounding box contains the surface at rest, in all motions and physiques, and in the
+    cache."""
     corners = [avatar.rest_points_m, *(boxes.reshape(-1, 3) for boxes in avatar.extents_m.values())]
     corners += [physique_box(avatar, name) for name in avatar.physiques_m]
     return np.concatenate([*corners, avatar.points_m.reshape(-1, 3)])
@@ -290,10 +291,11 @@ def _write_images(folder: Path, avatars: Avatars) -> None:
 
 
 def _forget_times(path: Path) -> None:
-    """Set the times of all files in a package to the first that ZIP knows, so that the same avatar is the same bytes.
+    """Set the times of all files in a package to the earliest that ZIP can store, so that the same avatar gives the
+    same bytes.
 
-    APPNOTE.TXT of PKWARE, 4.3.7 and 4.3.12: time and date lie at byte 10 of a local header and at byte 12 of an entry
-    of the directory, whose name, extra field and comment have the lengths at byte 28.
+    APPNOTE.TXT of PKWARE, 4.3.7 and 4.3.12: time and date are at byte 10 of a local header and at byte 12 of a
+    directory entry. The lengths of an entry's name, extra field and comment are at byte 28.
     """
     package = bytearray(path.read_bytes())
     with ZipFile(path) as archive:

@@ -1,4 +1,4 @@
-"""Defects of an asset's structure: what OpenUSD's guidelines ask of the root prim of a component."""
+"""Defects of an asset's structure, according to OpenUSD's guidelines for the root prim of a component."""
 
 import numpy as np
 from pxr import Kind, Usd, UsdGeom, UsdLux, UsdShade
@@ -25,7 +25,7 @@ def package_defects(stage: Usd.Stage) -> list[str]:
 
 
 def _extent_defects(root: Usd.Prim) -> list[str]:
-    """Return the defects of the box that the root prim gives for when payloads are not loaded."""
+    """Return the defects of the root prim's extentsHint, the box that serves while payloads are not loaded."""
     hint = np.array(UsdGeom.ModelAPI(root).GetExtentsHintAttr().Get() or [])
     if hint.shape[:1] != (2,) or hint.shape[1:] != (3,) or not np.isfinite(hint).all():
         return [f"{root.GetPath()}: has no extentsHint"]

@@ -17,20 +17,20 @@ from hnerf.progress import tracked
 from hnerf.side_by_side import side_by_side
 from hnerf.warp_import import wp
 
-OUTLIER = 0.15  # of a colour in [0, 1]: what differs more from the field is another limb, or a passing shadow
-COSINE_POWER = 4  # of the weight of a view by its angle to the normal
-EDGE_PX = 5  # neighbourhood in which a jump of depth is an outline, whose pixels mix two surfaces
-EDGE_SLOPE = 2.5  # of depth to width, from which a slope counts as a jump; seen so obliquely, it weighs nothing either
+OUTLIER = 0.15  # of a colour in [0, 1]: what differs more from the field is another limb or a passing shadow
+COSINE_POWER = 4  # a view's weight is this power of the cosine of its angle to the normal
+EDGE_PX = 5  # neighbourhood in which a jump in depth marks an outline, whose pixels mix two surfaces
+EDGE_SLOPE = 2.5  # depth over width, above which a slope counts as a jump; views so oblique hardly count anyway
 DEPTH_TOLERANCE_M = 0.01
-FAR_M = 1e3  # depth where a ray meets nothing
-BACK_PROJECTIONS = 3  # more sharpen noise
+FAR_M = 1e3  # depth where a ray hits nothing
+BACK_PROJECTIONS = 3  # more would sharpen noise
 FIELD_WEIGHT = 0.05  # of the field's colour; a view along the normal weighs 1
 
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """The surface of a frame, for several cameras to see: vertices_m (V, 3), faces (F, 3), unit normals (V, 3), and the
-    mesh for rays."""
+    """The surface of a frame, shared by all cameras: vertices_m (V, 3), faces (F, 3), unit normals (V, 3), and the mesh
+    for ray casting."""
 
     vertices_m: np.ndarray
     faces: np.ndarray
@@ -45,29 +45,31 @@ class SeenSurface:
 
 @dataclass(frozen=True)
 class TexelPixels:
-    """The pixels of a photograph in which texels lie: index (M,) int32 of the texels, pixel (M,) int32 of theirs among
-    colours (P, 3) float32 in [0, 1]."""
+    """The pixels of a photograph that contain texels. index (M,) int32: the texels; pixel (M,) int32: the row of each
+    one's pixel in colours (P, 3), float32 in [0, 1]."""
 
     index: np.ndarray
     pixel: np.ndarray
     colours: np.ndarray
 
     def unexplained(self, shown: np.ndarray) -> np.ndarray:
-        """Return by how much the pixel of each texel differs from the mean of its texels, which show (M, 3)."""
+        """Return the difference (M, 3) between the pixel of each texel and the mean colour of the texels in that pixel.
+        shown (M, 3): the colours of the texels."""
         count = np.bincount(self.pixel)[:, None]
         total = np.stack([np.bincount(self.pixel, channel) for channel in shown.T], 1)
         return (self.colours - total / count).astype(np.float32).take(self.pixel, 0)
 
 
 class BackProjection:
-    """Iterative back-projection (Irani and Peleg 1991): sharpens a weighted mean over photographs, each of whose pixels
-    has averaged its texels, until the texels, averaged over pixels again, look like the photographs."""
+    """Iterative back-projection (Irani and Peleg 1991). It sharpens a weighted mean over photographs, whose pixels
+    average their texels, so that the texels, averaged over pixels again, look like the photographs."""
 
     def __init__(self) -> None:
         self._views: list[tuple[TexelPixels, np.ndarray, np.ndarray | float]] = []
 
     def add(self, pixels: TexelPixels, counts: np.ndarray, light: np.ndarray | float = 1.0) -> None:
-        """Take in a photograph: the weights (M, 1) of its texels, and the light (M, 1) by which it shows them."""
+        """Add a photograph. counts (M, 1): the weights of its texels; light (M, 1): the light in which it shows
+        them."""
         self._views.append((pixels, counts.astype(np.float32), light))
 
     def sharpened(self, mean: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -83,8 +85,8 @@ class BackProjection:
 
 @dataclass(frozen=True)
 class SeenTexels:
-    """What a photograph shows of texels: the pixels in which they lie, cosine (M,) of the view to their unit normals
-    (M, 3), and colours (M, 3) in [0, 1], interpolated between pixels and divided by the camera's gains."""
+    """Texels as a photograph shows them. pixels: those that contain them; cosine (M,): between the view and their unit
+    normals (M, 3); colours (M, 3): in [0, 1], interpolated between pixels and divided by the camera's gains."""
 
     pixels: TexelPixels
     cosine: np.ndarray
@@ -97,15 +99,15 @@ class SeenTexels:
         return self.pixels.index
 
     def weights(self, expected: np.ndarray) -> np.ndarray:
-        """Return how much each texel counts, (M, 1): the fourth power of the cosine, and less the more its colour
+        """Return the weight of each texel, (M, 1): the fourth power of the cosine, reduced the more its colour
         contradicts the expected one (M, 3) (Geman-McClure)."""
         error = (self.colours - expected) / OUTLIER
         return (self.cosine**COSINE_POWER / (1 + _dot(error, error)) ** 2)[:, None]
 
 
 class CapturedBlend:
-    """The mean colour of texels over photographs, sharpened, weighted by their agreement with the field's colours (N,
-    3), which count a little everywhere, so that they are what no photograph shows."""
+    """The mean colour of texels over photographs, sharpened, and weighted by the agreement with the field's colours (N,
+    3). These have a small weight everywhere, so that they fill what no photograph shows."""
 
     def __init__(self, field_colours: np.ndarray) -> None:
         self._field = field_colours.astype(np.float32)
@@ -114,7 +116,7 @@ class CapturedBlend:
         self._projection = BackProjection()
 
     def add(self, seen: SeenTexels) -> None:
-        """Take in a photograph."""
+        """Add a photograph."""
         counts = seen.weights(self._field.take(seen.index, 0))
         self._weight[seen.index] += counts
         self._total[seen.index] += counts * seen.colours
@@ -128,8 +130,8 @@ class CapturedBlend:
 def photographed_texels(
     capture: Capture, gains: Gains, surfaces: Mapping[int, SeenSurface], texels: Texels
 ) -> Iterator[SeenTexels]:
-    """Yield what the training photographs of some frames, whose surfaces are given, show of the texels, where the
-    surface does not hide them, away from outlines."""
+    """Yield what each training photograph of the frames in `surfaces` shows of the texels: those that the surface does
+    not hide, away from outlines."""
 
     def seen_in(view: tuple[int, str]) -> SeenTexels:
         frame, name = view
@@ -171,7 +173,7 @@ def visible_texels(
 
 
 def _depth(camera: Camera, surface: SeenSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance (H, W) at which each pixel's ray meets a surface, and where it jumps (H, W) bool."""
+    """Return the distance (H, W) at which each pixel's ray hits a surface, and where it jumps, (H, W) bool."""
     at_px = camera.project(surface.vertices_m)[0]
     box_px = np.stack([np.floor(at_px.min(0)) - EDGE_PX, np.ceil(at_px.max(0)) + EDGE_PX + 1])
     lower, upper = box_px.clip(0, camera.size_px).astype(int)
@@ -187,7 +189,7 @@ def _depth(camera: Camera, surface: SeenSurface) -> tuple[np.ndarray, np.ndarray
 
 def sampled(image: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
     """Return the colours (M, 3) float32 in [0, 1] at points (M, 2) of an image (H, W, 3) uint8, by bilinear
-    interpolation; beyond its border, those of the border."""
+    interpolation. Points beyond the border take the border's colours."""
     height_px, width_px = image.shape[:2]
     x, y = pixels_px.T.clip(0, np.array([[width_px - 1], [height_px - 1]]))
     left, top = x.astype(np.int64), y.astype(np.int64)
@@ -204,5 +206,5 @@ def sampled(image: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the products (M,) of the rows of two arrays (M, 3); a sum along so short an axis is slower."""
+    """Return the dot products (M,) of the rows of two arrays (M, 3). A sum along so short an axis would be slower."""
     return np.einsum("mk,mk->m", a, b)

@@ -1,5 +1,4 @@
-"""Pictures of the asset for its report, drawn from its own arrays: turntable, wireframe, texture; (H, W, 3) uint8
-RGB."""
+"""Images of the asset for its report, drawn from its own arrays: turntable, wireframe, texture; (H, W, 3) uint8 RGB."""
 
 import cv2
 import numpy as np
@@ -39,9 +38,9 @@ def textured(shot: Shot, avatar: StagedAvatar) -> np.ndarray:
 def looks_on_black(
     surface: Surface, avatar: StagedAvatar, camera: Camera, size_px: tuple[int, int], gain: tuple[float, float, float]
 ) -> dict[str, np.ndarray]:
-    """Render a posed surface of the avatar as a camera exposes it, over black and with its coverage, (H, W, 4) uint8,
-    averaged to the size (width, height): "asset", with the captured texture, and "albedo", in its light, if there is
-    one."""
+    """Render a posed surface of the avatar as a camera exposes it: (H, W, 4) uint8, over black with coverage, averaged
+    down to size_px (width, height). The looks are "asset", with the captured texture, and, if there is one, "albedo",
+    in its light."""
     shot = shoot(surface, camera)
     colours = {"asset": _texture_colours(shot, avatar, avatar.texture)}
     if avatar.albedo:
@@ -53,7 +52,8 @@ def looks_on_black(
 
 
 def _exposed(colours: np.ndarray, shot: Shot, size_px: tuple[int, int], gain: tuple[float, float, float]) -> np.ndarray:
-    """Return colours (N, 3) from 0 to 255 of a camera's rays as it exposes them, as `looks_on_black` does."""
+    """Expose the colours (N, 3), from 0 to 255, of a camera's rays with its gain; return an image as in
+    `looks_on_black`."""
     fine, hits = shot.fine, shot.hits
     exposed = np.minimum(colours * np.array(gain, np.float32), 255)
     pixels = np.concatenate([exposed, np.full((len(exposed), 1), 255, np.float32)], 1) * (hits.face[:, None] >= 0)
@@ -64,7 +64,7 @@ def _exposed(colours: np.ndarray, shot: Shot, size_px: tuple[int, int], gain: tu
 def splats_on_black(
     splats: Splats, points_m: np.ndarray, camera: Camera, size_px: tuple[int, int], gain: tuple[float, float, float]
 ) -> np.ndarray:
-    """Render splats on a mesh with vertices (V, 3) likewise."""
+    """Render splats on a mesh with vertices points_m (V, 3), as in `looks_on_black`."""
     middles_m, _, quaternions = splats.on(points_m)
     exposed = np.minimum(splats.colours * np.array(gain), 1)
     fine = render_splats(middles_m, quaternions, splats.scales_m, OPACITY, exposed, supersampled(camera))
@@ -73,7 +73,7 @@ def splats_on_black(
 
 
 def _texture_colours(shot: Shot, avatar: StagedAvatar, texture: np.ndarray) -> np.ndarray:
-    """Return a texture's colours at the hits of rays, (N, 3) float32 from 0 to 255, of no meaning where a ray meets
+    """Return a texture's colours at the hits of rays, (N, 3) float32 from 0 to 255, undefined where a ray hits
     nothing."""
     fine, hits = shot.fine, shot.hits
     height_px, width_px = texture.shape[:2]
@@ -96,8 +96,8 @@ def wireframe(shot: Shot) -> np.ndarray:
 
 
 def _to_edge_m(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
-    """Return the distance from each hit to the nearest edge of its face: the least barycentric coordinate times its
-    height."""
+    """Return the distance from each hit to the nearest edge of its face: the least product of a barycentric coordinate
+    and the height over its edge."""
     met = hits.face >= 0
     corners_m = mesh.vertices[mesh.faces[hits.face[met]]]
     edges_m = np.linalg.norm(np.roll(corners_m, -1, 1) - np.roll(corners_m, -2, 1), axis=2)  # opposite to each corner
@@ -106,7 +106,7 @@ def _to_edge_m(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
 
 
 def texture_picture(texture: np.ndarray, side_px: int) -> np.ndarray:
-    """Return a texture, scaled to a square."""
+    """Return a texture scaled to a square."""
     return cv2.resize(texture, (side_px, side_px), interpolation=cv2.INTER_AREA)
 
 
@@ -114,7 +114,7 @@ def uv_picture(avatar: StagedAvatar, side_px: int) -> np.ndarray:
     """Draw the faces in the square of texture coordinates, on white."""
     picture = np.full((side_px, side_px, 3), 255, np.uint8)
     corners_px = (avatar.uvs * (1, -1) + (0, 1))[avatar.face_uvs] * side_px - 0.5
-    shift = 4  # bits of a pixel
+    shift = 4  # fractional bits of a pixel's coordinates
     fixed = (corners_px * 2**shift).round().astype(np.int32)
     for triangle in fixed:  # one by one: in one call, overlapping ones would cancel out
         cv2.fillConvexPoly(picture, triangle, PAPER.tolist(), cv2.LINE_AA, shift)

@@ -1,12 +1,12 @@
-"""Smooth displacements of a mesh: a thin plate that bends towards what is wanted, and keeps gaps of air open.
+"""Smooth displacements of a mesh: a thin plate that bends towards wanted displacements and keeps air gaps open.
 
-For displacements u (V, 3), wanted ones m (V, 3), trust w (V,) in them and areas a (V,) of the vertices, the plate takes
+With displacements u (V, 3), wanted ones m (V, 3), trust w (V,) in them and vertex areas a (V,), the plate solves
 
     min  sum_i a_i (w_i |u_i - m_i|^2 + e |u_i|^2)  +  l^4 sum_i a_i |lap u|_i^2  +  sum_g a_g (s / g)^2 |u_i - u_j|^2
 
-(Botsch and Sorkine 2008, "On Linear Variational Surface Deformation Methods"). Details shorter than l are left out. The
-last sum goes over pairs of points that face each other across a gap of width g, such as the sides of two fingers: they
-move alike, and do not meet.
+(Botsch and Sorkine 2008, "On Linear Variational Surface Deformation Methods"). Details shorter than l are smoothed
+away. The last sum runs over pairs of points that face each other across a gap of width g, such as the sides of two
+fingers: they move together, and do not meet.
 """
 
 from collections.abc import Callable
@@ -20,12 +20,12 @@ from scipy.sparse.linalg import splu
 from hnerf.body.descriptor import normals_of
 from hnerf.geometry.mesh_queries import Surface
 
-GAP_M = 0.025  # wider ones do not close
-NARROWEST_M = 0.001  # gaps count as this wide at least
+GAP_M = 0.025  # wider gaps do not close
+NARROWEST_M = 0.001  # gaps count as at least this wide
 GAP_WEIGHT_M = 0.01  # s: a gap of this width is as stiff as a match
 SKIN_WEIGHT = 1e-8  # e, which decides only where nothing else does
 LEAST_COTANGENT = 1e-3  # keeps the Laplacian's weights positive in obtuse triangles
-START_M = 1e-4  # off the surface, from where rays across a gap start
+START_M = 1e-4  # distance from the surface at which rays across a gap start
 LEAST_AREA_M2 = 1e-12
 
 
@@ -39,7 +39,7 @@ class Plate:
 
     @staticmethod
     def of(vertices_m: np.ndarray, faces: np.ndarray) -> "Plate":
-        """Return the plate at rest in a mesh (V, 3), (F, 3)."""
+        """Return the plate that is at rest as a mesh (V, 3), (F, 3)."""
         area_m2, laplacian = cotangent_laplacian(vertices_m, faces)
         pairs, width_m = facing_pairs(vertices_m, faces)
         stiffness = (GAP_WEIGHT_M / width_m.clip(NARROWEST_M)) ** 2 * (np.abs(pairs) @ area_m2) / 2
@@ -50,7 +50,7 @@ class Plate:
         )
 
     def solver(self, trust: np.ndarray, smoothing_m: float) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the function that maps wanted displacements (V, K) to smooth ones, for one trust (V,) in [0, 1]."""
+        """Return a function that maps wanted displacements (V, K) to smooth ones, for a fixed trust (V,) in [0, 1]."""
         pulled = self.area_m2 * trust
         own = diags_array(pulled + SKIN_WEIGHT * self.area_m2)
         matrix = csc_array(own + smoothing_m**4 * self.bending + self.gaps)
@@ -60,8 +60,8 @@ class Plate:
 
 
 def cotangent_laplacian(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, csr_array]:
-    """Return the areas of the vertices, (V,), a third of their faces each, and the Laplacian times them, (V, V), with
-    positive diagonal (Pinkall and Polthier 1993)."""
+    """Return the areas of the vertices, (V,), a third of each of their faces, and the Laplacian times these areas, (V,
+    V), with positive diagonal (Pinkall and Polthier 1993)."""
     n = len(vertices_m)
     a, b, c = vertices_m[faces].swapaxes(0, 1)
     twice_m2 = np.linalg.norm(np.cross(b - a, c - a), axis=1).clip(LEAST_AREA_M2)
@@ -77,8 +77,8 @@ def cotangent_laplacian(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.n
 
 
 def facing_pairs(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[csr_array, np.ndarray]:
-    """Return differences (P, V) between a vertex and the point that its outward normal meets across a gap of air, and
-    the widths (P,) of the gaps."""
+    """Return the matrix (P, V) of differences between a vertex and the point that its outward normal hits across an air
+    gap, and the widths (P,) of the gaps."""
     normals = normals_of(vertices_m, faces)
     surface = Surface(trimesh.Trimesh(vertices_m, faces, process=False))
     hits = surface.cast(vertices_m + START_M * normals, normals)

@@ -1,11 +1,11 @@
-"""Quads of a mesh that is kept as triangles, for formats that hold polygons."""
+"""Quads of a mesh that is stored as triangles, for formats that support polygons."""
 
 import numpy as np
 
 
 def polygon_corners(faces: np.ndarray) -> np.ndarray:
-    """Return the polygons of triangles (F, 3) as rows of their corners, which count through `faces.ravel()`: quads
-    (F / 2, 4) if each two triangles in turn are the halves of one, else the triangles themselves.
+    """Return the polygons of triangles (F, 3), as rows of indices into `faces.ravel()`: quads (F / 2, 4) if every two
+    successive triangles are the halves of one, else the triangles themselves.
 
     A quad begins on its diagonal, so that a fan from its first corner gives the same triangles.
     """
@@ -18,7 +18,7 @@ def polygon_corners(faces: np.ndarray) -> np.ndarray:
     if not ((shared.sum(1) == 2) & (foreign.sum(1) == 1)).all():
         return corners
     rows, tip = np.arange(len(first)), (~shared).argmax(1)
-    if not (first[rows, (tip + 1) % 3] == second[rows, (foreign.argmax(1) + 2) % 3]).all():  # turned the same way
+    if not (first[rows, (tip + 1) % 3] == second[rows, (foreign.argmax(1) + 2) % 3]).all():  # with the same orientation
         return corners
     own = [corners[0::2][rows, (tip + k) % 3] for k in (1, 2, 0)]
     return np.stack([own[0], corners[1::2][rows, foreign.argmax(1)], own[1], own[2]], 1)

@@ -10,14 +10,14 @@ from hnerf.evaluation.geometry import outer_samples
 from hnerf.geometry.mesh_queries import Surface
 
 SAMPLES = 20_000
-REGIONS = {  # by how the names of joints begin; all other joints are the torso's
+REGIONS = {  # by prefixes of joint names; all other joints belong to the torso
     "head": ("head", "neck", "eye", "jaw"),
     "arms": ("upperarm", "lowerarm"),
     "hands": ("wrist", "hand", "metacarpal", "finger"),
     "legs": ("upperleg", "lowerleg"),
     "feet": ("foot", "toe"),
 }
-LIMIT_MM = 10.0  # of the 95th percentile in a region: thick cloth stands so far from what it covers
+LIMIT_MM = 10.0  # of the 95th percentile in a region: thick cloth stands about this far from the skin
 
 Distances = dict[str, dict[str, float]]
 
@@ -28,8 +28,8 @@ def region_of(joint_name: str) -> str:
 
 
 def surface_distances_mm(dense: trimesh.Trimesh, meshes: Mapping[str, AssetMesh]) -> dict[str, Distances]:
-    """Return, by topology, the mean and the 95th percentile of distances from the outside of the field's surface to the
-    mesh, as a whole ("all") and by region of the registered mesh."""
+    """Return, by topology, the mean and the 95th percentile of the distances from the outside of the field's surface to
+    the mesh, for the whole ("all") and by region of the registered mesh."""
     points_m, _ = outer_samples(Surface(dense), SAMPLES, np.random.default_rng(0))
     surfaces = {name: Surface(mesh.trimesh) for name, mesh in meshes.items()}
     rig, (_, face) = meshes["registered"].rig, surfaces["registered"].closest(points_m)

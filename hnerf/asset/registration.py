@@ -20,14 +20,14 @@ SMOOTHING_M = (0.06, 0.04, 0.028, 0.02, 0.014, 0.01, 0.007, 0.005)  # from a lim
 COSINES = 0.3, 0.7  # between the normals of matched points: from no trust to full trust
 FARTHEST_M = 0.06  # typical of hair and loose clothes; a match much farther away is no match
 LOOSEN_STEPS = 12
-LOOSEN_M = 0.0005  # a step by which faces that cross each other retreat into the body
+LOOSEN_M = 0.0005  # by which faces that cross each other retreat into the body in a step
 LOOSEN_SMOOTHING_M = 0.002
 
 
 @dataclass(frozen=True)
 class Registration:
-    """A registered mesh: vertices_m (V, 3); trust (V,) in [0, 1] that a vertex was matched; plate: of the body it came
-    from."""
+    """A registered mesh: vertices_m (V, 3); trust (V,) in [0, 1] in the match of each vertex; plate: of the body from
+    which it was made."""
 
     vertices_m: np.ndarray
     trust: np.ndarray
@@ -37,9 +37,9 @@ class Registration:
 def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
     """Move the body's mesh onto a closed surface around it, both in the rest pose.
 
-    A match is trusted by the angle between its normals, and by its distance (Geman-McClure): a vertex in the middle of
-    its limb is as close to the limb's other side, so half the thickness there is the scale, FARTHEST_M at most. That
-    keeps fingers as they are where the field has a mitten.
+    A match is trusted by the angle between its normals, and by its distance (Geman-McClure). A vertex in the middle of
+    its limb is equally close to the limb's other side, so the scale is half the thickness there, FARTHEST_M at most.
+    This leaves fingers as they are where the field has a mitten.
     """
     body_m, faces = body.rig.vertices_m.double().numpy(), body.rig.faces.numpy()
     plate, surface = Plate.of(body_m, faces), Surface(target)
@@ -80,7 +80,7 @@ def _thickness_m(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _loosened(vertices_m: np.ndarray, faces: np.ndarray, skin_faces: int, plate: Plate) -> np.ndarray:
-    """Return the mesh with faces of its skin that cross each other drawn into the body."""
+    """Return the mesh with those faces of its skin that cross each other drawn into the body."""
     keep = plate.solver(np.ones(len(vertices_m)), LOOSEN_SMOOTHING_M)
     for _ in range(LOOSEN_STEPS):
         crossing = crossing_faces(vertices_m, faces[:skin_faces])

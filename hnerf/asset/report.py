@@ -1,4 +1,4 @@
-"""The report of the asset: one self-contained HTML file beside it, which links to the viewer."""
+"""The report of the asset: one self-contained HTML file next to it, which links to the viewer."""
 
 from functools import partial
 from itertools import chain
@@ -25,7 +25,7 @@ from hnerf.side_by_side import side_by_side
 
 TEMPLATES = Path(__file__).parent / "page"
 TURNS = 8  # views of the turntable
-COMPARED = 3  # views beside the field's
+COMPARED = 3  # views shown next to the field's
 SQUARE_PX = 640  # of the texture and its layout
 
 
@@ -39,8 +39,8 @@ def write_report(
     poses: list[ExtremePose],
     figures: dict[str, Any],
 ) -> None:
-    """Write the page of an avatar called `name`, shown in the pose of a frame. world_from_body (4, 4): the body's place
-    in it, Z up and facing -Y; figures: what `report.json` holds."""
+    """Write the page of an avatar called `name`, shown in the pose of a frame. world_from_body (4, 4): the transform of
+    the body, Z up and facing -Y, in that frame; figures: the content of `report.json`."""
     facing = avatar.stage_from_world @ -world_from_body[:3, 1]
     points_m = avatar.points_m[list(avatar.frames).index(frame)].astype(np.float64)
     surface = Surface(trimesh.Trimesh(points_m, avatar.faces, process=False))
@@ -74,7 +74,7 @@ def write_report(
 
 
 def _beside_field(view: Compared) -> list[GalleryPicture]:
-    """Return the photograph of a view, and all renders of it with their PSNR."""
+    """Return the photograph of a view and all its renders, with their PSNR."""
     captions = {"field": "Field", "asset": "Captured look", "albedo": "Albedo in its light", "splats": "Splats"}
     return [
         _picture(f"Photograph, camera {view.view.camera}, frame {view.view.frame}", view.photograph),

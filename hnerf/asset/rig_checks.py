@@ -1,4 +1,4 @@
-"""Defects of skeletons, skins, blend shapes and motions that OpenUSD's validators do not look for."""
+"""Defects of skeletons, skins, blend shapes and motions that OpenUSD's validators do not check."""
 
 import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdSkel
@@ -7,10 +7,10 @@ from hnerf.asset.rigs import GAME, GAME_INFLUENCES
 from hnerf.asset.staging import CAPTURED, RATES
 from hnerf.body.skeletons import PELVIS, ROOT
 
-SAME = 1e-4  # metres, or parts of 1, by which what must agree may differ
-ON_GROUND_M = 1e-3  # by which the captured body's lowest point may be off the ground
-ON_GROUND_CHANGED_M = 1e-2  # the same with less detail or in another shape
-EYE_OFF = 0.1  # of its radius, by which an eye's joint may be off the middle of its ball
+SAME = 1e-4  # metres, or parts of 1, by which values that must agree may differ
+ON_GROUND_M = 1e-3  # height by which the captured body's lowest point may be off the ground
+ON_GROUND_CHANGED_M = 1e-2  # the same for lower levels of detail and other shapes
+EYE_OFF = 0.1  # by which an eye's joint may be off the centre of its eyeball, over the eyeball's radius
 
 
 def skin_defects(prim: Usd.Prim) -> list[str]:
@@ -48,7 +48,7 @@ def skin_defects(prim: Usd.Prim) -> list[str]:
 
 
 def _eyes_off(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, skeleton: UsdSkel.Skeleton) -> list[str]:
-    """Return the names of the eyes whose joints are off the middle of the points (V, 3) that follow them. joints,
+    """Return the names of the eyes whose joints are off the centre of the points (V, 3) that follow them. joints,
     weights (V, K)."""
     off = []
     for j, (token, bind) in enumerate(
@@ -97,7 +97,7 @@ def skeleton_defects(skeleton: UsdSkel.Skeleton) -> list[str]:
 
 
 def _rest_defects(skeleton: UsdSkel.Skeleton, joints: list[str], rest: np.ndarray, bind: np.ndarray) -> list[str]:
-    """Return the defects of transforms at rest (J, 4, 4), for row vectors: rest to parents, bind to the stage."""
+    """Return the defects of transforms at rest (J, 4, 4), for row vectors: `rest` to parents, `bind` to the stage."""
     name, defects = skeleton.GetPath(), []
     turns = bind[:, :3, :3]
     right_handed = np.linalg.det(turns) > 0
@@ -138,7 +138,7 @@ def animation_defects(animation: UsdSkel.Animation) -> list[str]:
 
 
 def _rate_defects(animation: UsdSkel.Animation) -> list[str]:
-    """Return whether a motion resampled at a rate is not at that rate's whole frames."""
+    """Return a defect if a motion that was resampled at a rate is not sampled at that rate's whole frames."""
     stage = animation.GetPrim().GetStage()
     rates = {f"{CAPTURED}_{rate}": rate for rate in RATES}
     rate = rates.get(_selected(stage, "motion"))
@@ -150,11 +150,11 @@ def _rate_defects(animation: UsdSkel.Animation) -> list[str]:
 
 
 def _selected(stage: Usd.Stage, variants: str) -> str:
-    """Return which variant of a set the root prim has."""
+    """Return the root prim's selected variant of a set."""
     root = stage.GetDefaultPrim()
     return root.GetVariantSet(variants).GetVariantSelection() if root else ""
 
 
 def samples(attribute: Usd.Attribute) -> list[Usd.TimeCode]:
-    """Return the times at which an attribute has values; the default time without any."""
+    """Return the times at which an attribute has values; the default time if there are none."""
     return [Usd.TimeCode(t) for t in attribute.GetTimeSamples()] or [Usd.TimeCode.Default()]

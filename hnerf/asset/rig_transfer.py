@@ -16,14 +16,14 @@ REACH_M = 10.0  # no part of a person is further from the body than this
 
 
 def clothed_rig(rig: Rig, surface: trimesh.Trimesh) -> Rig:
-    """Return the same joints with another surface in the rest pose, whose weights are transferred."""
+    """Return the rig with another surface in the rest pose, to which its skin weights are transferred."""
     vertices_m = torch.from_numpy(surface.vertices).float()
     faces = torch.from_numpy(surface.faces).long()
     return with_surface(rig, vertices_m, faces, *transfer_skin_weights(rig, vertices_m, faces))
 
 
 def with_vertices(rig: Rig, vertices_m: Tensor) -> Rig:
-    """Return the rig with its vertices at vertices_m (V, 3), and the joint of each eye in the middle of its ball."""
+    """Return the rig with its vertices at vertices_m (V, 3), and the joint of each eye at the centre of its eyeball."""
     joints_m = rig.joints_m.clone()
     for j in (j for j, name in enumerate(rig.joint_names) if name.startswith("eye.")):
         ball = rig.dense_weights[:, j] > EYEBALL_WEIGHT
@@ -33,7 +33,7 @@ def with_vertices(rig: Rig, vertices_m: Tensor) -> Rig:
 
 
 def with_surface(rig: Rig, vertices_m: Tensor, faces: Tensor, skin_joints: Tensor, skin_weights: Tensor) -> Rig:
-    """Return the same joints with another surface. The shape is fixed (no basis), and there are no keypoints."""
+    """Return the rig with another surface. The shape is fixed (no basis), and there are no keypoints."""
     return dataclasses.replace(
         rig,
         vertices_m=vertices_m,
@@ -51,7 +51,7 @@ def with_surface(rig: Rig, vertices_m: Tensor, faces: Tensor, skin_joints: Tenso
 def transfer_skin_weights(rig: Rig, vertices_m: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Return joints (V, 8) and weights (V, 8) for a surface (V, 3), (F, 3) around the rest body, largest weight first.
 
-    Each vertex takes the weights at the closest point of the body, barycentric in its triangle; a few Laplacian passes
+    Each vertex takes the weights at the closest point of the body, interpolated in its triangle. A few Laplacian passes
     then smooth the jumps where the closest point leaps from one limb to another.
     """
     body, only = BodyMeshes(rig.vertices_m[None], rig.faces), torch.zeros(len(vertices_m), dtype=torch.int32)
@@ -66,7 +66,8 @@ def transfer_skin_weights(rig: Rig, vertices_m: Tensor, faces: Tensor) -> tuple[
 
 
 def strongest(weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the joints (V, 8) with the largest of the weights (V, J), largest first, and these, summing to 1."""
+    """Return, for each vertex, the joints (V, 8) with the largest of the weights (V, J), largest first, and these
+    weights, scaled to sum to 1."""
     top, joints = weights.topk(min(MAX_INFLUENCES, weights.shape[1]), dim=1)
     return torch.where(top > 0, joints, 0), top / top.sum(1, keepdim=True)
 

@@ -13,19 +13,20 @@ from hnerf.evenly_spaced import evenly_spaced
 
 FULL, GAME = "full", "game"
 GAME_INFLUENCES = 4
-EYEBALL_WEIGHT = 0.99  # of a point on an eyeball
+EYEBALL_WEIGHT = 0.99  # at least, of a point on an eyeball
 FITTED_FRAMES = 64  # at most, evenly spaced; more hardly change the weights
 
 
 @dataclass(frozen=True)
 class RestSurface:
-    """The surface at rest in stage axes: points_m (V, 3), and shapes_m (K, V, 3) added to it by weight."""
+    """The surface at rest in stage axes: points_m (V, 3), and blend shapes shapes_m (K, V, 3), added to them by
+    weight."""
 
     points_m: np.ndarray
     shapes_m: np.ndarray
 
     def shaped(self, weights: np.ndarray) -> np.ndarray:
-        """Return the points (V, 3) with blend shapes by their weights (K,)."""
+        """Return the points (V, 3) with the blend shapes added by weights (K,)."""
         return self.points_m + np.tensordot(weights, self.shapes_m, 1)
 
 
@@ -43,8 +44,8 @@ class JointMotion:
 
 @dataclass(frozen=True)
 class StagedRig:
-    """A skeleton, the skin that follows it, and its motions by name. stage (n, J, 4, 4), by motion: the transforms of
-    joints in the stage."""
+    """A skeleton, the skin that follows it, and its motions by name. stage (n, J, 4, 4), by motion: the joints'
+    transforms in the stage."""
 
     skeleton: Skeleton
     skin: Skin
@@ -54,8 +55,8 @@ class StagedRig:
     def surfaces_m(
         self, motion: str, rest: RestSurface, rows: Sequence[int] | slice = slice(None)
     ) -> Iterator[np.ndarray]:
-        """Yield the surface (V, 3) at each time code of a motion, or at some rows of these: blend shapes, then the
-        skin."""
+        """Yield the surface (V, 3) at each time code of a motion, or only at some rows of them: with blend shapes, then
+        skinned."""
         weights = self.motions[motion].shape_weights[rows]
         for transforms, points_m in posed_frames(self.skeleton, self.stage[motion][rows], rest, weights):
             yield skinned(transforms, self.skin, points_m)
@@ -74,12 +75,12 @@ def posed_frames(
 def stage_rigs(
     rig: Rig, joints_m: np.ndarray, rest: RestSurface, motions: dict[str, Motion], floor_m: float, bones: Bones
 ) -> dict[str, StagedRig]:
-    """Return both rigs of a body model's rig, whose joints are at rest at joints_m (S, 3). motions: the first is the
+    """Return both rigs made from a body model's rig. joints_m (S, 3): its joints at rest; motions: the first is the
     captured one, to which the game rig's weights are fitted; floor_m: the height of the ground in the stage."""
     parents = rig.parents.numpy()
     skin = without_lids(Skin(rig.skin_joints.numpy(), rig.skin_weights.double().numpy()), rig.joint_names, parents)
     full = full_skeleton(rig.joint_names, parents, joints_m, bones)
-    skin = Skin(np.where(skin.weights > 0, skin.joints + 1, 0), skin.weights)  # a root was added before them
+    skin = Skin(np.where(skin.weights > 0, skin.joints + 1, 0), skin.weights)  # a root joint was added before them
     poses = {name: motion.transforms(parents, joints_m) for name, motion in motions.items()}
     game, taken_by = game_skeleton(full, bones)
     staged = {
@@ -91,9 +92,9 @@ def stage_rigs(
 
 
 def without_lids(skin: Skin, joints: tuple[str, ...], parents: np.ndarray) -> Skin:
-    """Return the skin whose points follow eyes only where they are eyeballs, that is, follow one alone; where either
-    eye has none, no point does. The head takes the others: lids must not turn with the eyes. `joints`: the body
-    model's names."""
+    """Return a skin in which only eyeballs follow the eyes, that is, points that follow one eye alone. If either eye
+    has none, no point does. All other points follow the head instead, since lids must not turn with the eyes. joints:
+    the body model's joint names."""
     eyes = [j for j, name in enumerate(joints) if name.startswith("eye.")]
     at_head = skin.moved_to(np.array([parents[j] if j in eyes else j for j in range(len(joints))]))
     of_eye = [((skin.joints == eye) & (skin.weights > EYEBALL_WEIGHT)).any(1) for eye in eyes]
@@ -116,7 +117,7 @@ def _motions(
 
 
 def _with_game_skin(game: StagedRig, captured: str, rest: RestSurface) -> StagedRig:
-    """Return the rig with few influences a point, those that change the captured surfaces least."""
+    """Return the rig with few influences per point, chosen so that the captured surfaces change least."""
     chosen = evenly_spaced(range(len(game.stage[captured])), FITTED_FRAMES)
     weights = game.motions[captured].shape_weights[chosen]
     poses = posed_frames(game.skeleton, game.stage[captured][chosen], rest, weights)

@@ -1,4 +1,4 @@
-"""What the training photographs tell of the light: colours of the surface's vertices, at many normals each."""
+"""What the training photographs tell about the light: colours of the surface's vertices, each at many normals."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -14,13 +14,13 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.rays import cast
 from hnerf.side_by_side import side_by_side
 
-HIDDEN_M = 0.01  # in front of a vertex, another surface hides it
-ASIDE_PX = 2  # a vertex beside which the surface ends or jumps is on an outline, whose pixels mix two surfaces
+HIDDEN_M = 0.01  # a surface farther in front of a vertex hides it
+ASIDE_PX = 2  # if the surface ends or jumps so near a vertex, it is on an outline, whose pixels mix two surfaces
 
 
 def photographed_shading(capture: Capture, gains: Gains, surfaces: Mapping[int, SeenSurface]) -> Shading:
-    """Return the colours of all vertices in the training photographs of some frames, whose surfaces are given, weighted
-    by the fourth power of the cosine to the normal. Gains of cameras are divided out."""
+    """Return the colours of all visible vertices in the training photographs of the frames in `surfaces`, weighted by
+    the fourth power of the cosine to the normal. The cameras' gains are divided out."""
 
     def seen_in(view: tuple[int, str]) -> tuple[np.ndarray, ...]:
         frame, name = view

@@ -18,9 +18,10 @@ def simplify(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 
 
 def collapse_edges(meshes: pymeshlab.MeshSet, faces: int, onto_ends: bool) -> None:
-    """Collapse edges of the current mesh until it has at most `faces` triangles, to the best point, or, onto_ends, to
-    one of their ends (quadrics, Garland and Heckbert 1997). The latter keeps every edge of an open mesh's boundary."""
-    meshes.meshing_decimation_quadric_edge_collapse(  # what is not given is as in the last call
+    """Collapse edges of the current mesh until it has at most `faces` triangles (quadrics, Garland and Heckbert 1997).
+    Edges collapse to their best point or, with onto_ends, to one of their ends. The latter keeps every edge of an open
+    mesh's boundary."""
+    meshes.meshing_decimation_quadric_edge_collapse(  # arguments that are not given keep the values of the last call
         targetfacenum=faces,
         preservetopology=True,
         preservenormal=True,
@@ -35,4 +36,4 @@ def _repair(meshes: pymeshlab.MeshSet) -> None:
     meshes.meshing_remove_duplicate_faces()
     meshes.meshing_repair_non_manifold_edges()
     meshes.meshing_repair_non_manifold_vertices()
-    meshes.meshing_close_holes(newfaceselected=False)  # later filters would only look at a selection
+    meshes.meshing_close_holes(newfaceselected=False)  # or later filters would only act on the selection

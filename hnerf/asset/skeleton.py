@@ -1,4 +1,5 @@
-"""The exported skeleton: a joint on the ground above the body model's, readable names, and orientations.
+"""The exported skeleton: the body model's joints, with readable names and orientations, below a root joint on the
+ground.
 
 All in the axes of asset formats (Y up, metres), at rest: the soles at height 0, the pelvis above the origin.
 """
@@ -13,13 +14,13 @@ from hnerf.body.skeletons import ROOT, exported_name, is_serial
 Bones = Literal["along", "identity"]
 
 FRONT, UP = np.array([0.0, 0, 1]), np.array([0.0, 1, 0])  # of the rest body
-SHORTEST_M = 1e-3  # joints nearer than this to each other give no direction
+SHORTEST_M = 1e-3  # joints closer together than this give no direction
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints at rest, parents before children. names (J,), parents (J,): -1 at the root; sources (J,): each one's joint
-    of the body model, -1 for the root on the ground; positions_m (J, 3); rotations (J, 3, 3): stage from joint."""
+    """Joints at rest, parents before children. names (J,); parents (J,): -1 for the root; sources (J,): the body
+    model's joint for each, -1 for the root on the ground; positions_m (J, 3); rotations (J, 3, 3): stage from joint."""
 
     names: tuple[str, ...]
     parents: np.ndarray
@@ -41,9 +42,10 @@ class Skeleton:
         return found
 
     def posed(self, turned: np.ndarray, ground: np.ndarray) -> np.ndarray:
-        """Return the joints' transforms (n, J, 4, 4) in the stage in poses of the body model.
+        """Return the joints' transforms (n, J, 4, 4) in the stage for poses of the body model.
 
-        turned (n, S, 4, 4): its joints, whose orientations at rest are the identity; ground (n, 4, 4): the root.
+        turned (n, S, 4, 4): the model's joints, whose orientations at rest are the identity; ground (n, 4, 4): the
+        root.
         """
         transforms = np.concatenate([ground[:, None], turned], 1)[:, self.sources + 1]
         transforms[..., :3, :3] = transforms[..., :3, :3] @ self.rotations
@@ -59,8 +61,8 @@ def full_skeleton(joints: tuple[str, ...], parents: np.ndarray, positions_m: np.
 
 
 def game_skeleton(full: Skeleton, bones: Bones) -> tuple[Skeleton, np.ndarray]:
-    """Return the skeleton without joints in series, and for each joint of the full one (J,) the joint of this one that
-    takes its skin: itself, or the nearest above it that is kept. All toes go to the middle one."""
+    """Return the skeleton without serial joints, and, for each joint of the full one (J,), the joint of this one that
+    takes its skin: itself, or the nearest one above it that is kept. All toes go to the middle one."""
     kept = [j for j, name in enumerate(full.names) if not is_serial(name)]
     place = {j: k for k, j in enumerate(kept)}
     taken_by = np.zeros(len(full.names), np.int64)
@@ -88,8 +90,8 @@ def _rotations(names: tuple[str, ...], parents: np.ndarray, positions_m: np.ndar
 
 
 def along_bones(names: tuple[str, ...], parents: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
-    """Return joint orientations (J, 3, 3) with Y along the bone, as Blender has it, and Z as far to the front as that
-    allows; up for feet, toes and eyes, which point to the front themselves."""
+    """Return joint orientations (J, 3, 3) with Y along the bone, as in Blender, and Z as close to the front as that
+    allows; for feet, toes and eyes, which point to the front themselves, Z is close to up."""
     directions = _directions(names, parents, positions_m)
     reference = np.array([UP if _points_to_front(name) else FRONT for name in names])
     z = reference - (reference * directions).sum(1, keepdims=True) * directions
@@ -102,10 +104,10 @@ def _points_to_front(name: str) -> bool:
 
 
 def _directions(names: tuple[str, ...], parents: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
-    """Return the bones' directions (J, 3): to the middle of the joints below, of which the trunk's count only those of
-    the trunk. The head points up, eyes to the front, other last joints of a chain as the bone above.
+    """Return the bones' directions (J, 3), each to the mean of the joints below it. For joints of the trunk, only those
+    of the trunk count. The head points up, eyes point to the front, and other end joints continue the bone above.
 
-    Joints that coincide with the one below them, as the pelvis does with the spine, have its direction.
+    A joint that coincides with the one below it, as the pelvis does with the spine, has the direction of that one.
     """
     directions = np.zeros((len(names), 3))
     sided = np.array([name.endswith(("_L", "_R")) for name in names])

@@ -1,4 +1,4 @@
-"""Linear blend skinning of an exported rig, and its weights refitted to few joints a point."""
+"""Linear blend skinning of an exported rig, and the refitting of its weights to few joints per point."""
 
 import itertools
 from collections.abc import Iterator
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-WEIGHT_COST_M = 1e-3  # a weight that moves by 1 costs as much as a point that moves this far, where poses do not tell
+WEIGHT_COST_M = 1e-3  # to change a weight by 1 costs as much as to move a point this far; decides where poses do not
 
 
 @dataclass(frozen=True)
 class Skin:
-    """Skin weights. joints (V, K), weights (V, K) summing to 1, largest first; unused ones are joint 0 with 0."""
+    """Skin weights. joints (V, K); weights (V, K) sum to 1, largest first; unused entries are joint 0 with weight 0."""
 
     joints: np.ndarray
     weights: np.ndarray
@@ -37,11 +37,11 @@ def skinned(transforms: np.ndarray, skin: Skin, points_m: np.ndarray) -> np.ndar
 
 
 def with_few_influences(skin: Skin, poses: Iterator[tuple[np.ndarray, np.ndarray]], influences: int) -> Skin:
-    """Return weights on at most `influences` joints a point that move the points least.
+    """Return the skin with at most `influences` joints per point whose weights move the points least.
 
     poses: transforms from rest to stage (J, 4, 4) and points at rest (V, 3), frame by frame. The mean squared movement
-    is a quadratic form in the change of weights; it is solved, with weights that sum to 1, for every subset of a
-    point's joints, and the best solution without a negative weight is the least of all.
+    is a quadratic form in the change of weights. It is minimised, with weights that sum to 1, for every subset of a
+    point's joints; the best solution without a negative weight is the global minimum.
     """
     many = np.nonzero((skin.weights > 0).sum(1) > influences)[0]
     if not len(many):

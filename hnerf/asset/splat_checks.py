@@ -1,11 +1,11 @@
-"""Defects of splats that OpenUSD's validators do not look for."""
+"""Defects of splats that OpenUSD's validators do not check."""
 
 import numpy as np
 from pxr import Usd, UsdVol
 
 from hnerf.asset.rig_checks import samples
 
-UNIT = 5e-3  # by which the length of a quaternion in half precision may be off 1
+UNIT = 5e-3  # by which the length of a half-precision quaternion may differ from 1
 
 
 def splat_defects(prim: Usd.Prim) -> list[str]:

@@ -18,7 +18,7 @@ PROPERTIES = (
 
 def write_splat_ply(path: Path, avatar: StagedAvatar, splats: Splats) -> None:
     """Write the splats at rest: the opacity as a logit, scales as logarithms, rotations as w x y z. Joints and weights
-    are those of the game rig. All are float32, since some readers take every property for one."""
+    are those of the game rig. All are float32, since some readers assume that of every property."""
     middles_m, normals, quaternions = splats.on(avatar.rest_points_m)
     skin = splats.skin(avatar.rigs[GAME])
     same = np.array([np.log(OPACITY / (1 - OPACITY)), *np.log(splats.scales_m)])

@@ -8,12 +8,12 @@ from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.staging import CAPTURED, StagedAvatar
 from hnerf.asset.usd import ROOT, extent, vec3f
 
-SIGMAS = 3  # from a splat's middle to the end of its box
+SIGMAS = 3  # from a splat's centre to the end of its box
 
 
 def author_splats(stage: Usd.Stage, avatar: StagedAvatar, splats: Splats) -> None:
-    """Define the splats, which the schema cannot skin: middles and orientations (half precision) at each frame of the
-    captured motion, as the full rig moves the surface with its blend shapes."""
+    """Define the splats. Since the schema cannot skin them, they have centres and orientations (half precision) at each
+    frame of the captured motion, as the full rig moves the surface with its blend shapes."""
     prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, ROOT.AppendChild("Splats"))
     count = len(splats.face)
     prim.CreateScalesAttr(vec3f(np.tile(splats.scales_m, (count, 1))))

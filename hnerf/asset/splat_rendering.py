@@ -1,7 +1,7 @@
 """A plain renderer of Gaussian splats by the equations of 3D Gaussian Splatting (Kerbl et al. 2023).
 
 The published program also adds 0.3 px² to each spread, which thickens outlines where splats are smaller than pixels.
-Here the caller takes finer pixels instead.
+Here the caller renders at a finer resolution instead.
 """
 
 from collections.abc import Iterator
@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.geometry.camera import Camera
 
-NEAREST_M = 0.05  # what is nearer to the camera is left out
-FAINTEST = 1 / 255  # of an opacity that is drawn
+NEAREST_M = 0.05  # splats nearer to the camera are left out
+FAINTEST = 1 / 255  # least opacity that is drawn
 MOST_AT_ONCE = 1_000_000  # pairs of a splat and a pixel
 
 
@@ -24,10 +24,11 @@ def render_splats(
     colours: np.ndarray,
     camera: Camera,
 ) -> np.ndarray:
-    """Return the picture of splats (H, W, 4): colours over black and the coverage, from 0 to 1.
+    """Return an image of splats (H, W, 4): colours over black and the coverage, from 0 to 1.
 
-    middles_m (N, 3), quaternions (N, 4) as w x y z, colours (N, 3); scales_m (3,) and opacity are those of all. From
-    front to back, a splat adds c alpha times what those before it let through, the product of their 1 - alpha (eq. 3).
+    middles_m (N, 3), quaternions (N, 4) as w x y z, colours (N, 3); scales_m (3,) and opacity are shared by all. From
+    front to back, a splat adds c alpha times what those in front of it let through, the product of their 1 - alpha (eq.
+    3).
     """
     ahead = camera.project(middles_m)[1] > NEAREST_M
     middles_px, depth_m = camera.project(middles_m[ahead])
@@ -49,14 +50,14 @@ def render_splats(
 
 
 def covariances(quaternions: np.ndarray, scales_m: np.ndarray) -> np.ndarray:
-    """Return R S S^T R^T (N, 3, 3), of rotations by unit quaternions (N, 4), w x y z, and scales (3,) (eq. 6)."""
+    """Return R S S^T R^T (N, 3, 3) for rotations by unit quaternions (N, 4), w x y z, and scales (3,) (eq. 6)."""
     axes_m = Rotation.from_quat(quaternions, scalar_first=True).as_matrix() * scales_m
     return axes_m @ axes_m.swapaxes(1, 2)
 
 
 def projected(middles_m: np.ndarray, covariances_m2: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return J W V W^T J^T (N, 2, 2) of covariances V (N, 3, 3), in square pixels: W turns the world to the camera, and
-    J is the Jacobian of the projection at the middles (eq. 5)."""
+    """Return J W V W^T J^T (N, 2, 2) for covariances V (N, 3, 3), in square pixels: W rotates the world to the camera,
+    and J is the Jacobian of the projection at the splats' centres (eq. 5)."""
     pixels_px, depth_m = camera.project(middles_m)
     jacobians = (camera.K[:2] - pixels_px[:, :, None] * camera.K[2]) / depth_m[:, None, None] @ camera.R
     return jacobians @ covariances_m2 @ jacobians.swapaxes(1, 2)
@@ -65,8 +66,8 @@ def projected(middles_m: np.ndarray, covariances_m2: np.ndarray, camera: Camera)
 def _touched(
     middles_px: np.ndarray, spreads_px2: np.ndarray, opacity: float, camera: Camera
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield splats, the pixels that they touch, row by row, and their alpha there, all (M,): in blocks from front to
-    back, inside which pixels are in order, and the splats of each one from front to back."""
+    """Yield splats, the pixels that they touch, counted row by row, and their alpha there, all (M,), in blocks from
+    front to back. Within a block, pixels are sorted, and the splats of each pixel go from front to back."""
     reach = np.sqrt(2 * np.log(opacity / FAINTEST)) * np.sqrt(np.diagonal(spreads_px2, axis1=1, axis2=2))
     low = np.ceil(middles_px - reach).clip(0, camera.size_px).astype(np.int64)
     size = (np.floor(middles_px + reach).clip(-1, np.array(camera.size_px) - 1).astype(np.int64) - low + 1).clip(0)

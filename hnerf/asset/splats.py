@@ -10,17 +10,17 @@ from hnerf.asset.skinning import Skin, largest_first
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.descriptor import normals_of
 
-OPACITY = 0.99  # in the middle; renderers let no splat hide more
-SPREAD = 1.4  # sigma in radii of a disc with a splat's share of the area: seen from above, 0.4 % shine through
-THINNESS = 0.1  # of sigma, across the surface
-INFLUENCES = 4  # joints of a splat
+OPACITY = 0.99  # at the centre; renderers allow no more
+SPREAD = 1.4  # sigma in radii of a disc with a splat's share of the area: seen from above, 0.4 % shines through
+THINNESS = 0.1  # thickness across the surface, in sigma
+INFLUENCES = 4  # joints per splat
 HARMONIC = 0.28209479177387814  # the spherical harmonic of degree 0
 GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Splats on a mesh of faces (F, 3). face (N,), barycentric (N, 3): their middles; colours (N, 3): sRGB from 0 to 1;
+    """Splats on a mesh of faces (F, 3). face (N,), barycentric (N, 3): their centres; colours (N, 3): sRGB from 0 to 1;
     sigma_m: standard deviation along the surface."""
 
     faces: np.ndarray
@@ -36,24 +36,25 @@ class Splats:
 
     @property
     def coefficients(self) -> np.ndarray:
-        """Return the colours as coefficients (N, 3) of that harmonic, to which renderers add a half."""
+        """Return the colours as coefficients (N, 3) of the harmonic of degree 0, to which renderers add 0.5."""
         return (self.colours - 0.5) / HARMONIC
 
     def at(self, per_vertex: np.ndarray) -> np.ndarray:
-        """Return values (V, C) of the vertices at the splats, (N, C)."""
+        """Interpolate vertex values (V, C) at the splats, (N, C)."""
         corners, share = self.faces[self.face].T, self.barycentric.T[..., None]
         a, b, c = (per_vertex[at] * by for at, by in zip(corners, share, strict=True))
         return a + b + c
 
     def on(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the splats' middles, unit normals (N, 3) and orientations (N, 4), as w x y z, where the mesh has
-        vertices (V, 3)."""
+        """Return the splats' centres (N, 3), unit normals (N, 3) and orientations (N, 4), as w x y z, on the mesh with
+        vertices points_m (V, 3)."""
         normals = self.at(normals_of(points_m, self.faces))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
         return self.at(points_m), normals, turned_to(normals)
 
     def skin(self, rig: StagedRig) -> Skin:
-        """Return the splats' skin: the weights of the surface where they are, of the INFLUENCES strongest joints."""
+        """Return the splats' skin: the weights of the surface at each splat, limited to the INFLUENCES strongest
+        joints."""
         vertices, joints = len(rig.skin.joints), max(len(rig.skeleton.names), INFLUENCES)
         weights = np.zeros((vertices, joints))
         np.add.at(weights, (np.arange(vertices)[:, None], rig.skin.joints), rig.skin.weights)
@@ -78,10 +79,10 @@ def surface_splats(avatar: StagedAvatar, count: int) -> Splats:
 def evenly_on_faces(areas_m2: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return faces (N,) and barycentric coordinates (N, 3) of points that are spread evenly over faces with areas (F,).
 
-    Along the areas laid end to end the points are at equal steps, so that a face has its share to within one point.
-    There, the place between the ends of its area is the first coordinate of the point in the face, and multiples of the
-    golden ratio are the second; the triangle is filled evenly by their map (Turk 1990, Generating random points in
-    triangles).
+    The areas are laid end to end and the points placed on them at equal steps, so that a face gets its share to within
+    one point. The place of a point between the ends of its face's area is its first coordinate in the face; multiples
+    of the golden ratio are the second. The map of Turk (1990, Generating random points in triangles) then fills the
+    triangle evenly.
     """
     ends_m2 = np.cumsum(areas_m2)
     along_m2 = (np.arange(count) + 0.5) / count * ends_m2[-1]
@@ -95,5 +96,5 @@ def turned_to(normals: np.ndarray) -> np.ndarray:
     """Return the smallest rotations of Z to unit normals (N, 3) as unit quaternions (N, 4), w x y z."""
     x, y, z = normals.T
     quaternions = np.stack([1 + z, -y, x, np.zeros_like(z)], 1)
-    quaternions[z < -1 + 1e-9] = 0, 1, 0, 0  # opposite: about any axis across
+    quaternions[z < -1 + 1e-9] = 0, 1, 0, 0  # opposite: half a turn about any perpendicular axis
     return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)

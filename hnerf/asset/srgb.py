@@ -1,4 +1,4 @@
-"""The encoding of pictures: sRGB (IEC 61966-2-1). Values are from 0 to 1."""
+"""The encoding of images: sRGB (IEC 61966-2-1). Values are from 0 to 1."""
 
 import numpy as np
 

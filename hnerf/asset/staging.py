@@ -19,21 +19,21 @@ from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 from hnerf.progress import tracked
 
 CAPTURED = "captured"  # the motion at the capture's own rate, whose time codes are the capture's frames
-RATES = (24, 30)  # frames a second that it is resampled at, since many importers ignore a file's rate
-STILL_M = 1e-5  # what a blend shape moves by less, it does not move
+RATES = (24, 30)  # frames a second at which it is resampled, since many importers ignore a file's rate
+STILL_M = 1e-5  # points that a blend shape moves by less count as unmoved
 REST_POSE = "A"  # of every body model here: arms slanting down
 
 
 @dataclass(frozen=True)
 class StagedAvatar:
-    """The arrays of an avatar ready to be written; numpy, float64 and int64 unless said otherwise.
+    """The arrays of an avatar ready to be written; numpy, float64 and int64 unless stated otherwise.
 
     rest_points_m (V, 3), the soles at height 0. levels: the mesh at full detail, then with fewer and fewer faces.
     shapes_m (K, V, 3) float32: corrective blend shapes, applied before the skin; expressions_m (V, 3) float32, by name:
-    those of the face, which no motion uses; physiques_m, likewise: of other physiques around the same bones. rigs:
+    blend shapes of the face, which no motion uses; physiques_m, likewise: other physiques around the same bones. rigs:
     "full", with all joints of the body model, and "game", with few joints and influences. frames (n,): of the capture;
-    points_m (n, V, 3) float32: the surface of each. extents_m: the box (2, 3) at each time code of each motion, (n, 2,
-    3). texture (H, W, 3) uint8 sRGB. stage_from_world (3, 3): a rotation. albedo, with its light in the stage, and
+    points_m (n, V, 3) float32: the surface in each frame. extents_m (n, 2, 3), by motion: the box at each time code.
+    texture (H, W, 3) uint8 sRGB. stage_from_world (3, 3): a rotation. albedo, with its light in the stage, and
     normal_map (S, S, 3) uint8, in tangent space, if there are any.
     """
 
@@ -117,15 +117,16 @@ def stage_avatar(
 ) -> StagedAvatar:
     """Turn a clothed body (see `clothed_rig`) and its motion to Y up, with both rigs. surfaces_m (n, V, 3): its surface
     in each frame; `up`: the vertical axis of the world, "y" or "z"; fps: of the frames; further: motions of the same
-    joints in the same world with their frames a second, by name; albedo: with its light in the world; level_faces: of
-    lower levels of detail; expressions_m, physiques_m (V, 3): of the face and of other bodies, in the body's axes."""
+    joints in the same world with their frame rates, by name; albedo: with its light in the world; level_faces: face
+    counts of the lower levels of detail; expressions_m, physiques_m (V, 3): of the face and of other bodies, in the
+    body's axes."""
     world, rig, body = stage_from_world(up), clothed.rig, Y_UP_FROM_Z_UP
     rest_m, joints_m = rig.vertices_m.double().numpy() @ body.T, rig.joints_m.double().numpy() @ body.T
     stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
     rest = RestSurface(rest_m - stands_m, correctives.offsets_m @ body.T.astype(np.float32))
     points_m = surfaces_m @ world.T.astype(np.float32)
     motions = _motions(clothed, fps, correctives.weights, further or {}, world)
-    floor_m = float(np.median(points_m[..., 1].min(1)))  # single frames have a foot some centimetres below it
+    floor_m = float(np.median(points_m[..., 1].min(1)))  # the median, since some frames have a foot centimetres lower
     rigs = stage_rigs(rig, joints_m - stands_m, rest, motions, floor_m, bones)
     return StagedAvatar(
         rest_points_m=rest.points_m,
@@ -155,8 +156,8 @@ def _turned(shapes_m: Mapping[str, np.ndarray] | None, rotation: np.ndarray) -> 
 
 
 def moved_points(offsets_m: np.ndarray) -> np.ndarray:
-    """Return which points a blend shape (V, 3) moves, (n,); the first one if it moves none, since formats take no
-    points for all points."""
+    """Return which points a blend shape (V, 3) moves, (n,); the first one if it moves none, since formats take an empty
+    list for all points."""
     moved = np.flatnonzero(np.abs(offsets_m).max(1) > STILL_M)
     return moved if len(moved) else np.zeros(1, np.int64)
 
@@ -169,8 +170,8 @@ def stage_from_world(up: str) -> np.ndarray:
 def _motions(
     clothed: BodyFit, fps: float, weights: np.ndarray, further: Mapping[str, tuple[BodyFit, float]], world: np.ndarray
 ) -> dict[str, Motion]:
-    """Return the captured motion, first, that motion at other rates, and further ones without blend shapes, which begin
-    at its first instant."""
+    """Return the captured motion first, then the same motion at other rates, then further ones, which have no blend
+    shapes and begin at the captured motion's first instant."""
     captured = motion_of(clothed, fps, weights, world)
     motions = {CAPTURED: captured, **{f"{CAPTURED}_{rate}": resampled(captured, rate) for rate in RATES}}
     for name, (body, rate) in further.items():

@@ -1,4 +1,4 @@
-"""The asset of a finished subject, made again with other settings or further motions."""
+"""The asset of a finished subject, exported again with other settings or further motions."""
 
 import re
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ def export_subject(
     """Export a subject (<store>/subjects/<name>) into the new folder `out`; return the report of `export_asset`.
 
     motions: files or subjects to add (`read_motion`), named after their files; digest: of the recording. Raises
-    InputError where a file is missing, or a motion cannot be read or has another's name.
+    InputError if a file is missing, a motion cannot be read, or its name is already in use.
     """
     with atomic_folder(out) as partial:
         require_files(subject, NEEDED)
@@ -36,7 +36,7 @@ def export_subject(
 
 
 def _named(motions: Iterable[Path]) -> dict[str, Motion]:
-    """Read motions; each is called as its file or folder, with underscores for what a name cannot have."""
+    """Read motions; each is named after its file or folder, with underscores for characters that a name cannot have."""
     found: dict[str, Motion] = {}
     for path in motions:
         called = path.resolve().name if path.is_dir() else path.stem  # a subject's name may have dots

@@ -1,8 +1,8 @@
 """Tangent frames of a textured mesh, after MikkTSpace (Mikkelsen 2008), which glTF and Blender use, too.
 
-At a vertex N is the normal, T points along rising u at right angles to N, and B = w N x T along rising v; w is -1 where
-texture coordinates are mirrored, else 1. Across a face N and T are interpolated, and not scaled to unit length. The
-components (x, y, z) of a direction are those of normalise(x T + y B + z N).
+At a vertex, N is the normal, T points along rising u at right angles to N, and B = w N x T along rising v; w is -1
+where texture coordinates are mirrored, else 1. Across a face, N and T are interpolated and not scaled to unit length.
+Components (x, y, z) describe the direction normalise(x T + y B + z N).
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class Frames:
     bitangent: np.ndarray
 
     def components(self, directions: np.ndarray) -> np.ndarray:
-        """Return what the directions (N, 3) are in the frames, unit vectors (N, 3)."""
+        """Return the components of directions (N, 3) in the frames, as unit vectors (N, 3)."""
         level = self.tangent - _dot(self.tangent, self.normal) / _dot(self.normal, self.normal) * self.normal
         x = _dot(directions, level) / _dot(level, level).clip(1e-12)
         y = _dot(directions, self.bitangent) / _dot(self.bitangent, self.bitangent).clip(1e-12)
@@ -33,8 +33,8 @@ def uv_tangents(points_m: np.ndarray, normals: np.ndarray, faces: np.ndarray, la
     """Return the tangent of each texture coordinate, (U, 4): the unit vector T and w. points_m, normals (V, 3); faces
     (F, 3).
 
-    The mean of its faces' directions of rising u, brought at right angles to the normal, weighted by the faces' angles
-    there. Where mirrored faces share a coordinate, w is that of the greater angle.
+    T is the mean of its faces' directions of rising u, made perpendicular to the normal and weighted by the faces'
+    angles there. Where mirrored and other faces share a coordinate, w is that of the greater angle.
     """
     count = len(layout.uvs)
     along, mirrored = _rising_u(points_m[faces], layout.uvs[layout.face_uvs])
@@ -67,13 +67,13 @@ def corner_angles(triangles: np.ndarray) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (..., 3) at unit length, zero where they have none."""
+    """Return vectors (..., 3) scaled to unit length; zero vectors stay zero."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True).clip(1e-20)
 
 
 def _rising_u(triangles: np.ndarray, uvs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return in which unit direction u rises on triangles (F, 3, 3) with uvs (F, 3, 2), (F, 3), zero without any area
-    in the texture, and which are mirrored there, (F,)."""
+    """Return the unit direction (F, 3) in which u rises on triangles (F, 3, 3) with uvs (F, 3, 2), zero if they have no
+    area in the texture, and which triangles are mirrored there, (F,)."""
     first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     (u1, v1), (u2, v2) = (uvs[:, 1] - uvs[:, 0]).T, (uvs[:, 2] - uvs[:, 0]).T
     area = u1 * v2 - u2 * v1
@@ -87,5 +87,5 @@ def _at_right_angles(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the products (N, 1) of vectors (N, 3)."""
+    """Return the dot products (N, 1) of vectors (N, 3)."""
     return (a * b).sum(1, keepdims=True)

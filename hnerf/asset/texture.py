@@ -1,4 +1,4 @@
-"""Texture coordinates, texels, and the picture made of their colours."""
+"""Texture coordinates, texels, and the image made of their colours."""
 
 import ctypes
 from dataclasses import dataclass
@@ -36,9 +36,9 @@ class Texels:
     barycentric: Tensor
 
     def interpolate(self, per_vertex: np.ndarray, faces: np.ndarray, index: np.ndarray | slice = ALL) -> np.ndarray:
-        """Return values (V, C) of the vertices of faces (F, 3) at the texels of an index, (M, C)."""
+        """Interpolate vertex values (V, C) on faces (F, 3) at the texels of an index, (M, C)."""
         corners, share = faces.take(self.face.numpy()[index], 0).T, self.barycentric.numpy()[index].T[..., None]
-        # A corner at a time takes half the time of all three at once, and `take` half that of an index.
+        # One corner at a time takes half the time of all three at once, and `take` half that of indexing.
         a, b, c = (per_vertex.take(at, 0) * by for at, by in zip(corners, share, strict=True))
         return a + b + c
 
@@ -75,7 +75,7 @@ def rasterise(layout: UvLayout, texture_px: int) -> Texels:
     a, b, c = corners_px[face].swapaxes(0, 1)
     weights = np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], 1)
     area = weights.sum(1, keepdims=True)
-    # The centre of a texel that faces only touch lies outside them.
+    # If faces only touch a texel, its centre lies outside them.
     inside = np.clip(weights / np.where(area == 0, 1, area), 0, None) + 1e-9
     barycentric = torch.from_numpy(inside / inside.sum(1, keepdims=True)).float()
     return Texels(torch.from_numpy(row), torch.from_numpy(column), torch.from_numpy(face).long(), barycentric)

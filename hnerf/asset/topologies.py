@@ -22,9 +22,8 @@ HALVINGS = 10
 
 @dataclass(frozen=True)
 class AssetMesh:
-    """A mesh in the rest pose: its rig; settle: what makes the displacements (V, 3) of single frames agree with each
-    other; skin_faces: how many of the first faces are closed skin; base: the body's mesh that it has the topology of,
-    if any."""
+    """A mesh in the rest pose: its rig; settle: smooths the displacements (V, 3) of a single frame; skin_faces: how
+    many of the first faces are closed skin; base: the body's mesh whose topology it has, if any."""
 
     rig: Rig
     settle: Callable[[np.ndarray], np.ndarray]
@@ -33,7 +32,7 @@ class AssetMesh:
 
     @cached_property
     def trimesh(self) -> trimesh.Trimesh:
-        """Return all of the mesh."""
+        """Return the whole mesh."""
         return trimesh.Trimesh(self.rig.vertices_m.numpy(), self.rig.faces.numpy(), process=False)
 
     @property
@@ -62,8 +61,8 @@ class AssetMesh:
         return dataclasses.replace(self, rig=with_vertices(self.rig, vertices_m))
 
     def layout(self, texture_px: int) -> UvLayout:
-        """Return the texture coordinates: the body model's where it has some, else charts of the body at its shape,
-        else of this mesh."""
+        """Return the texture coordinates: the body model's if it has some, else charts of the body at its shape.
+        Without a body's mesh, return charts of this mesh."""
         if self.base is None:
             return unwrap(self.trimesh.vertices, self.trimesh.faces, texture_px)
         if self.base.uvs is None or self.base.face_uvs is None:
@@ -73,7 +72,7 @@ class AssetMesh:
 
 def registered_mesh(rig: Rig, dense: trimesh.Trimesh) -> AssetMesh:
     """Return the body model's mesh moved onto the field's surface in the rest pose, with the body model's strongest
-    joint weights. Joints stay where they are, but for those of eyes."""
+    joint weights. Only the joints of the eyes move."""
     base = base_mesh(rig)
     found = register(base, dense)
     moved = with_vertices(base.rig, torch.from_numpy(found.vertices_m).float())
@@ -82,6 +81,6 @@ def registered_mesh(rig: Rig, dense: trimesh.Trimesh) -> AssetMesh:
 
 
 def captured_mesh(rig: Rig, dense: trimesh.Trimesh, faces: int) -> AssetMesh:
-    """Return that surface decimated to at most so many triangles, with joint weights from the body beneath."""
+    """Return the field's surface decimated to at most `faces` triangles, with joint weights from the body beneath."""
     surface = simplify(dense, faces)
     return AssetMesh(clothed_rig(rig, surface), as_they_are, len(surface.faces), None)

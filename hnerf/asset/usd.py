@@ -1,6 +1,6 @@
 """Prims of USD files: geometry, look, rigs, motions and cameras, each at its place below /Avatar.
 
-Y up, metres. Matrices are transposed on the way in (USD has row vectors).
+Y up, metres. Matrices are transposed when they are written (USD uses row vectors).
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,18 +29,19 @@ REST_NOTE = (
 
 
 def surface_path(level: int) -> Sdf.Path:
-    """Return where the mesh is at a level of detail. Each has a prim of its own, since rigs have weights for each."""
+    """Return the path of the mesh at a level of detail. Each level has its own prim, since rigs have weights for
+    each."""
     return BODY.AppendChild(f"Surface_lod{level}" if level else "Surface")
 
 
 def surface_paths(avatar: StagedAvatar) -> list[Sdf.Path]:
-    """Return where the mesh is at all levels of detail."""
+    """Return the paths of the mesh at all levels of detail."""
     return [surface_path(level) for level in range(len(avatar.levels))]
 
 
 def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
-    """Define the skinned mesh at a level of detail, with its blend shapes; `author_shape` places its points, and rigs
-    bind it."""
+    """Define the skinned mesh at a level of detail, with its blend shapes. `author_shape` sets its points, and
+    `author_rig` binds it."""
     UsdSkel.Root.Define(stage, BODY)
     path, kept = surface_path(level), avatar.levels[level].vertices
     mesh = define_mesh(stage, path, avatar, level)
@@ -58,8 +59,8 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
 
 
 def author_shape(stage: Usd.Stage, avatar: StagedAvatar, physique: str | None) -> None:
-    """Place the mesh at rest at all levels of detail, as captured or in another physique. The body's extent is then a
-    box around it in any motion."""
+    """Set the points of the mesh at rest at all levels of detail, as captured or in another physique. For the latter,
+    the body's extent becomes a box around it in any motion."""
     points_m, normals = avatar.rest_points_m, avatar.normals
     if physique is not None:
         points_m = points_m + avatar.physiques_m[physique]
@@ -74,23 +75,24 @@ def author_shape(stage: Usd.Stage, avatar: StagedAvatar, physique: str | None) -
 
 
 def physique_box(avatar: StagedAvatar, name: str) -> np.ndarray:
-    """Return a box (2, 3) that holds a physique in all motions: that of the captured body, grown by how far the skin
-    moves at most. (Skinned points are no farther apart than at rest: their weights are not negative and sum to 1.)"""
+    """Return a box (2, 3) that holds a physique in all motions: the captured body's, grown by the greatest displacement
+    of the physique. (Skinning moves no two points farther apart than at rest: weights are not negative and sum to
+    1.)"""
     boxes, moved_m = np.concatenate(list(avatar.extents_m.values())), avatar.physiques_m[name]
     grown_m = np.linalg.norm(moved_m, axis=1).max()
     return np.stack([boxes[:, 0].min(0) - grown_m, boxes[:, 1].max(0) + grown_m])
 
 
 def author_captured_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, prefix: str = "") -> None:
-    """Bind meshes to the texture in the recording's light; prefix: of the names of its pictures."""
+    """Bind meshes to the texture in the recording's light. prefix: of the names of its images."""
     _define_material(stage, "Captured", TEXTURE_NAME, meshes, avatar, prefix)
 
 
 def author_albedo_look(
     stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, intensity: float, prefix: str = ""
 ) -> None:
-    """Bind meshes to the albedo, and define the recording's light: intensity times the picture LIGHT_NAME; prefix: of
-    the names of its pictures."""
+    """Bind meshes to the albedo, and define the recording's light: intensity times the image LIGHT_NAME. prefix: of the
+    names of its images."""
     _define_material(stage, "Albedo", ALBEDO_NAME, meshes, avatar, prefix)
     light = UsdLux.DomeLight.Define(stage, ROOT.AppendChild("Light"))
     light.CreateIntensityAttr(intensity)
@@ -113,7 +115,7 @@ def _define_material(
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
     surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
-    surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(1.0)  # no sheen: what there was is in the colours
+    surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(1.0)  # no sheen: what there was is already in the colours
     colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
     if avatar.normal_map is not None:
@@ -142,8 +144,8 @@ def _define_texture(
 
 
 def author_rig(stage: Usd.Stage, name: str, rig: StagedRig, levels: Sequence[Level]) -> None:
-    """Define a rig: its skeleton, the skin weights of the mesh at all levels of detail, and which motions are its
-    own."""
+    """Define a rig: its skeleton, the skin weights of the mesh at all levels of detail, and which motions belong to
+    it."""
     skeleton = UsdSkel.Skeleton.Define(stage, SKELETON)
     skeleton.CreateJointsAttr(joint_paths(rig.skeleton))
     skeleton.CreateJointNamesAttr(rig.skeleton.names)
@@ -200,13 +202,14 @@ def joint_paths(skeleton: Skeleton) -> list[str]:
 
 
 def _names_elsewhere(skeleton: Skeleton) -> dict[str, dict[str, str]]:
-    """Return what other skeletons call the joints, by skeleton and joint."""
+    """Return the joints' names in other skeletons, by skeleton and joint."""
     known = {name: EQUIVALENTS[name] for name in skeleton.names if name in EQUIVALENTS}
     return {s: {ours: getattr(n, s) for ours, n in known.items() if getattr(n, s)} for s in SKELETONS}
 
 
 def define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, stage_from_world: np.ndarray) -> UsdGeom.Camera:
-    """Define a pinhole camera as USD has it: it looks along -Z, apertures and focal length in tenths of a scene unit.
+    """Define a pinhole camera in USD's conventions: it looks along -Z, apertures and focal length are in tenths of a
+    scene unit.
 
     Pixel centres are at integers here, so the principal point lies (cx + 1/2) / W across the image.
     """

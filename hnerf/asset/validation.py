@@ -1,4 +1,4 @@
-"""Validation of USD packages, in all their variants: OpenUSD's own validators, and what they do not look for."""
+"""Validation of USD packages in all their variants, by OpenUSD's own validators and checks that they lack."""
 
 import itertools
 from collections.abc import Iterator
@@ -40,9 +40,10 @@ def validate_package(path: Path) -> dict[str, Any]:
 
 
 def each_variant(stage: Usd.Stage) -> Iterator[str]:
-    """Select combinations of the root prim's variants in turn, in the session layer, and yield what a message says of
-    each: nothing without variants, else like "rig=full motion=captured: ". They are all those that have at least two of
-    the motion, the shape and the level of detail that the file itself selects, in each topology."""
+    """Select combinations of the root prim's variants in turn, in the session layer. Yield for each the start of a
+    message about it, like "rig=full motion=captured: ", or nothing without variants. In each topology, these are all
+    combinations that keep at least two of the motion, the shape and the level of detail that the file itself
+    selects."""
     stage.SetEditTarget(stage.GetSessionLayer())
     root = stage.GetDefaultPrim()
     topologies = root.GetVariantSet("topology").GetVariantNames() if root else []
@@ -52,7 +53,8 @@ def each_variant(stage: Usd.Stage) -> Iterator[str]:
 
 
 def _each_inside(root: Usd.Prim, topology: str) -> Iterator[str]:
-    """Select what `each_variant` says inside a topology, if there is one: it has other variants than the next."""
+    """Select what `each_variant` describes inside a topology, if there is one. Topologies differ in their other
+    variants."""
     if topology:
         root.GetVariantSet("topology").SetVariantSelection(topology)
     sets = {} if not root else {name: root.GetVariantSet(name) for name in root.GetVariantSets().GetNames()}
@@ -69,8 +71,8 @@ def _each_inside(root: Usd.Prim, topology: str) -> Iterator[str]:
 
 
 def data_defects(stage: Usd.Stage) -> list[str]:
-    """Return one line for each defect in units, structure, meshes, skinning, skeletons and splats, as variants are
-    selected."""
+    """Return one line for each defect in units, structure, meshes, skinning, skeletons and splats, for the selected
+    variants."""
     defects = []
     if UsdGeom.GetStageMetersPerUnit(stage) != 1.0:
         defects.append(f"metersPerUnit is {UsdGeom.GetStageMetersPerUnit(stage)}, not 1")

@@ -1,4 +1,4 @@
-"""The page on which anyone can turn the avatar: one HTML file that opens offline and asks the network for nothing.
+"""The page on which anyone can turn the avatar: one HTML file that works offline and makes no network requests.
 
 It carries avatar.glb, photographs of the recording, three.js and the modules under `page/`, which do the work.
 """
@@ -24,8 +24,8 @@ from hnerf.models import LICENCES, THREE_SHA256, has_model, model_file
 PAGE = Path(__file__).parent / "page"
 MAX_BYTES = 8_000_000
 GZIP_LEVEL = 6  # 9 takes nine times as long for 4 % less
-TEXTURES_PX = (8192, 4096, 2048, 1024, 512)  # the first at which the page is small enough
-CAMERAS, PHOTOGRAPHS = 8, 5  # at most, and of each camera
+TEXTURES_PX = (8192, 4096, 2048, 1024, 512)  # tried in turn until the page is small enough
+CAMERAS, PHOTOGRAPHS = 8, 5  # at most; photographs are of each camera
 PHOTOGRAPH_PX = 384  # longer side
 RELATIVE_IMPORT = re.compile(r"from '\.{1,2}/(?:[\w./]*/)?([\w.]+\.js)'")  # as in three.js
 
@@ -33,7 +33,8 @@ log = logging.getLogger("hnerf.asset")
 
 
 def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.ndarray) -> str:
-    """Write the page of an avatar; return its name, or one line that says why there is none, which is logged, too.
+    """Write the page of an avatar. Return its name, or, if it cannot be written, the reason in one line, which is
+    logged, too.
 
     stage_from_world (3, 3): from the capture's world to the avatar's. The texture is halved until the page has at most
     MAX_BYTES; if that does not suffice, a warning is logged.
@@ -66,10 +67,11 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
 
 
 def recording(capture: Capture, stage_from_world: np.ndarray) -> dict[str, Any]:
-    """Return what the page knows of the capture: its time, and training cameras with photographs of training frames.
+    """Return the data of the capture that the page shows: its time, and training cameras with photographs of training
+    frames.
 
-    Instants are seconds from the first frame. `pose`: row by row the camera's place in the avatar's world, with the
-    axes of OpenGL (x right, y up, looking along -z).
+    Instants are seconds from the first frame. `pose`: the camera's transform in the avatar's world, row by row, with
+    the axes of OpenGL (x right, y up, looking along -z).
     """
     names = evenly_spaced(capture.train_cameras, CAMERAS)
     frames = evenly_spaced(capture.train_frames, PHOTOGRAPHS)

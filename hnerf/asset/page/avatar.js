@@ -4,7 +4,7 @@ import * as THREE from "three";
 import { GLTFLoader } from "three/GLTFLoader.js";
 import { jointShares, posedBox, useAllInfluences } from "viewer/influences.js";
 
-const GROUND_SAMPLES = 6; // instants of a motion at which its lowest point is looked for
+const GROUND_SAMPLES = 6; // instants of a motion at which its lowest point is sought
 
 export class Avatar {
   static async load(bytes) {
@@ -44,7 +44,7 @@ export class Avatar {
     return this.motion ? this.motion.duration : 0;
   }
 
-  // Whether the motion is the recorded one, which the file has first; others have no frames of the recording.
+  // Whether the motion is the recorded one, the file's first; others have no frames of the recording.
   get showsRecording() {
     return this.motion === this.motions[0];
   }
@@ -121,7 +121,7 @@ export class Avatar {
 }
 
 // Returns the blend shapes: one for each name, which several meshes may share, with the largest weight that a motion
-// gives it, and whether any gives it one: others are expressions and physiques.
+// gives it, and whether any motion uses it; those that none uses are expressions and physiques.
 function shapesOf(meshes, motions) {
   const shapes = new Map();
   for (const mesh of meshes) {

@@ -58,7 +58,7 @@ function run(viewer) {
     }
     requestAnimationFrame(draw);
   };
-  requestAnimationFrame((first) => draw((last = first))); // the clock of frames lags behind performance.now()
+  requestAnimationFrame((first) => draw((last = first))); // animation time stamps lag behind performance.now()
 }
 
 function connectMotion(viewer) {

@@ -28,7 +28,7 @@ export class Photographs {
     return sorted.find((photograph) => direction * (photograph.time_s - time) > 1e-3) ?? sorted[0];
   }
 
-  // Shows the photograph nearest to an instant, pale where it is of another one, or where the motion is not the recorded
+  // Shows the photograph nearest to an instant, pale if it is of another instant or if the motion is not the recorded
   // one.
   show(time, isRecorded) {
     if (!this.camera) return;

@@ -8,7 +8,7 @@ const NEAR_M = 0.05;
 const FAR_M = 200;
 const KEY_TURN_RAD = 0.1;
 const KEY_ZOOM = 1.1;
-const MARGIN = 1.12; // height of the picture over that of the person
+const MARGIN = 1.12; // height of the image over that of the person
 const SIDEWAYS_RAD = 0.35;
 const RAISED = 0.12;
 const CELL_M = 0.5;
@@ -111,7 +111,7 @@ export class Stage {
     if (this.recorded) this.project(this.recorded, width, height);
   }
 
-  // Projects so that the recorded picture, as large as fits into the middle of the canvas, meets its pixels: their
+  // Projects so that the photograph, as large as fits into the middle of the canvas, matches pixel by pixel. Pixel
   // centres are at integers, so that its left edge is at -0.5.
   project({ fx, fy, cx, cy, width, height }, canvasWidth, canvasHeight) {
     const scale = Math.min(canvasWidth / width, canvasHeight / height);
