@@ -1,4 +1,4 @@
-"""The machine that measurements were taken on."""
+"""The machine on which measurements were taken."""
 
 import os
 import platform
@@ -10,8 +10,8 @@ from hnerf.results import Machine
 
 
 def machine() -> Machine:
-    """Return the processor, its cores and how many of them torch uses, the GPU (None without one), and the versions
-    that speed depends on."""
+    """Return the processor, its cores and how many of them torch uses, the GPU (None if there is none), and the
+    versions on which speed depends."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -26,6 +26,6 @@ def machine() -> Machine:
 
 
 def describe_machine(found: Machine) -> str:
-    """Describe a result of `machine` as part of a sentence."""
+    """Describe a result of `machine` as a part of a sentence."""
     cores, gpu = f"{found['threads']} of {found['cores']} cores", found["gpu"] or "no GPU"
     return f"{found['cpu']}, {cores}, {gpu}, torch {found['torch']}, Python {found['python']}"

@@ -1,4 +1,4 @@
-"""Check of a reconstructed surface: whether it is closed and about as large as the body in it."""
+"""Check of a reconstructed surface: whether it is closed and about as large as the body inside it."""
 
 from dataclasses import dataclass
 
@@ -20,8 +20,8 @@ LENGTH_RANGE = 0.8, 1.25
 
 @dataclass(frozen=True)
 class SurfaceCheck:
-    """The result of a check. fault: what is wrong with the surface, in one line, None if nothing; volume and length
-    (the longest side of the bounding box) as shares of the body's, None if there is no surface."""
+    """The result of a check. fault: what is wrong with the surface, in one line, or None; volume and length (the
+    longest side of the bounding box): as shares of the body's, None if there is no surface."""
 
     fault: str | None
     volume: float | None = None
@@ -29,7 +29,7 @@ class SurfaceCheck:
 
 
 def check_surface(mesh: trimesh.Trimesh, body_m: np.ndarray, faces: np.ndarray) -> SurfaceCheck:
-    """Compare a surface, its largest component, with the posed body: vertices (V, 3) and faces (F, 3)."""
+    """Compare a surface, the largest component of a mesh, with the posed body: vertices (V, 3) and faces (F, 3)."""
     body = trimesh.Trimesh(body_m, faces, process=False)
     volume, length = float(mesh.volume / body.volume), float(mesh.extents.max() / body.extents.max())
     fault = None if mesh.is_watertight else "surface is not watertight"

@@ -1,4 +1,4 @@
-"""Charts of a benchmark. Methods differ in line style, marker and name as well as colour, so that they can be told
+"""Charts of a benchmark. Methods differ in line style, marker and name as well as in colour, so that they can be told
 apart in greyscale."""
 
 import textwrap
@@ -18,8 +18,8 @@ from hnerf.study.benchmark.curves import Point, bin_edges, bin_means, pareto_fro
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 PANEL_INCHES = (6.2, 3.5)
-PANEL_HEIGHT_PT = 190  # points of type from the lowest to the highest value of an axis
-LABEL_GAP = 0.07  # of a panel's height, between labels at line ends
+PANEL_HEIGHT_PT = 190  # typographic points from the lowest to the highest value of an axis
+LABEL_GAP = 0.07  # between labels at line ends, as a share of a panel's height
 LABEL_LIFT_PT = 7.0
 CHARACTERS_PER_INCH = 13
 
@@ -30,8 +30,8 @@ NO_REASONS: Mapping[str, str] = {}
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """One row of the speed chart, by method: curves (training seconds, accuracy), the reasons why they end if known,
-    points (seconds a frame, accuracy); and the PSNR of trivial pictures, by title."""
+    """One row of the speed chart. By method: curves (training seconds, accuracy), the reasons why they end, if known,
+    and points (seconds per frame, accuracy). By title: the PSNR of trivial images."""
 
     curves: Curves
     end_reasons: Mapping[str, str]
@@ -58,11 +58,11 @@ def speed_chart(
     caption: str,
     path: Path,
 ) -> None:
-    """Draw a row for each title: accuracy over training seconds, with the accuracy of trivial pictures as lines, and
-    accuracy over seconds a frame with its Pareto front. The reason why a curve ends, if there is one, is written beside
+    """Draw a row for each title: accuracy over training seconds, with lines for the accuracy of trivial images, and
+    accuracy over seconds per frame, with its Pareto front. If there is a reason why a curve ends, it is written next to
     its name.
 
-    labels: of training time, seconds a frame, accuracy.
+    labels: of training time, seconds per frame, accuracy.
     """
     figure, axes = _figure(len(rows), 2)
     for (left, right), (title, row) in zip(axes, rows.items(), strict=True):
@@ -85,7 +85,7 @@ def speed_chart(
 def sweep_chart(
     panels: Sequence[tuple[str, Curves]], method_styles: Mapping[str, Style], x_label: str, caption: str, path: Path
 ) -> None:
-    """Draw a panel for each (label, curves): a score of the finished models over the number of cameras or frames in
+    """Draw a panel for each (label, curves): a score of the finished models over the number of cameras or frames, in
     which the variants of a study differ, on a logarithmic axis."""
     figure, axes = _figure(1, len(panels))
     for panel, (y_label, curves) in zip(axes[0], panels, strict=True):
@@ -105,8 +105,8 @@ def training_distance_chart(
     caption: str,
     path: Path,
 ) -> None:
-    """Draw a panel for each (title, labels of x and y, points by method): a mark for every image or surface, a line
-    through the means of bins of equal width, and the number of points in each bin."""
+    """Draw a panel for each (title, labels of x and y, points by method): a mark for each image or surface, a line
+    through the means of equally wide bins, and the number of points in each bin."""
     figure, axes = _figure(-(-len(panels) // 2), min(2, len(panels)))
     slots = [panel for row in axes for panel in row]
     for panel, (title, labels, clouds) in zip(slots, panels, strict=False):
@@ -130,7 +130,7 @@ def training_distance_chart(
 
 
 def picture_grid(rows: Sequence[tuple[str, Sequence[tuple[str, Any]]]], caption: str, path: Path) -> None:
-    """Draw the pictures (H, W, 3) uint8 of each row side by side, each under its name, with the row's title before the
+    """Draw the images (H, W, 3) uint8 of each row side by side, each under its name, with the row's title before the
     first."""
     columns = max(len(pictures) for _, pictures in rows)
     figure = Figure(figsize=(2.0 * columns + 0.4, 2.9 * len(rows) + 0.5), dpi=150, layout="constrained")
@@ -150,8 +150,8 @@ def picture_grid(rows: Sequence[tuple[str, Sequence[tuple[str, Any]]]], caption:
 def draw_curves(
     axes: Axes, curves: Curves, method_styles: Mapping[str, Style], end_reasons: Mapping[str, str] = NO_REASONS
 ) -> None:
-    """Draw a line a method with its name at the end; if there is a reason why it ends, write it beside the name and end
-    the line with a large marker and a bar."""
+    """Draw a line per method, with its name at the end. If there is a reason why a line ends, write it next to the name
+    and mark the end with a large marker and a bar."""
     drawn = {name: points for name, points in curves.items() if points}
     for name, points in drawn.items():
         axes.plot(*zip(*points, strict=True), linewidth=1.7, markersize=5, **method_styles[name])
@@ -162,7 +162,7 @@ def draw_curves(
 
 
 def draw_pareto_front(axes: Axes, points: Mapping[str, Point], method_styles: Mapping[str, Style]) -> None:
-    """Draw a mark a method and the Pareto front: any point to the right of it and below is beaten in both time and
+    """Draw a mark per method and the Pareto front: points to the right of it and below are worse in both time and
     accuracy. Draw nothing if there are no points."""
     if not points:
         return
@@ -193,8 +193,8 @@ def _label_points(
     lift: float = 0.0,
     end_reasons: Mapping[str, str] = NO_REASONS,
 ) -> None:
-    """Write names to the right of their points, each with its end's reason, raised by `lift` points of type and further
-    where labels would overlap."""
+    """Write names to the right of their points, with the reasons why their curves end. Labels are raised by `lift`
+    typographic points, and further where they would overlap."""
     low, high = axes.get_ylim()
     free = low
     for name, (x, y) in sorted(places.items(), key=lambda place: place[1][1]):

@@ -14,18 +14,17 @@ from hnerf.tables import pick
 Result = Mapping[str, Any]
 Finding = tuple[bool, str]  # whether a score supports the claim, and the score in words
 
-# Words, digits, and the sign of better: -1 where less is better.
+# Words, digits, and the sign of an improvement: -1 if less is better.
 PSNR, CHAMFER = "psnr", "geometry.chamfer_l2_e3"
 FIGURES = {PSNR: ("{} dB", 1, 1), CHAMFER: ("Chamfer {}", 3, -1)}
-# What another seed may cost: decibels, and a factor on the squared distance (docs/findings.md).
+# What a different seed may cost: decibels, and a factor on the squared distance (docs/findings.md).
 SEED_DB, SEED_RATIO = 0.4, 1.1
-WEAK = 0.5  # correlation below which there is no trend
-NO_SURFACE = 0.1  # IoU below which a mesh is no surface of the person
+WEAK = 0.5  # correlation below which there is no trend, by absolute value
+NO_SURFACE = 0.1  # IoU below which a mesh does not count as the person's surface
 
 
 def claim_lines(result: Result) -> list[str]:
-    """Return a line of Markdown for each claim of the study: whether the scores support it, and which scores these
-    are."""
+    """Return a line of Markdown for each claim of the study: whether the scores support it, and the scores."""
     lines = []
     for claim in result["claims"]:
         findings = list(CHECKS[claim["check"]](result))
@@ -38,8 +37,8 @@ def claim_lines(result: Result) -> list[str]:
 
 
 def more_is_better(result: Result) -> Iterator[Finding]:
-    """Check, for every method, that scores with the most cameras or frames are better than with the fewest, and on the
-    way never fall by more than another seed may cost."""
+    """Check, for every method, that scores are better with the most cameras or frames than with the fewest, and never
+    fall in between by more than another seed may cost."""
     for key, (_, _, sign) in FIGURES.items():
         for name, curve in sweep_curves(result, key).items():
             values = [value for _, value in curve]
@@ -49,8 +48,8 @@ def more_is_better(result: Result) -> Iterator[Finding]:
 
 
 def loses_least(result: Result) -> Iterator[Finding]:
-    """Check that from the most cameras or frames to the fewest H-NeRF loses less than each other method, over those
-    with which both have scores; where the other alone has one, the claim is not supported."""
+    """Check that H-NeRF loses less than each other method from the most cameras or frames to the fewest, among those
+    for which both have scores. Where only the other method has a score, the claim is not supported."""
     for key, (_, _, sign) in FIGURES.items():
         curves = {name: dict(curve) for name, curve in sweep_curves(result, key).items()}
         for first in _h_nerf(result, curves):
@@ -67,8 +66,8 @@ def loses_least(result: Result) -> Iterator[Finding]:
 
 
 def ahead(result: Result) -> Iterator[Finding]:
-    """Check that in every variant H-NeRF's scores are better than each other method's; where it was tried and
-    has none, they are not."""
+    """Check that in every variant H-NeRF's scores are better than those of each other method. Where H-NeRF was run and
+    has no score, the claim is not supported."""
     for title, variant in result["variants"].items():
         for key, (_, _, sign) in FIGURES.items():
             values = {name: pick(scores[scores["split"]], key) for name, scores in scored_methods(variant).items()}
@@ -82,7 +81,8 @@ def ahead(result: Result) -> Iterator[Finding]:
 
 
 def falls_with_angle(result: Result) -> Iterator[Finding]:
-    """Check, for every method, that images farthest in angle from training cameras are worse than the nearest."""
+    """Check, for every method, that the images farthest in angle from training cameras are worse than the nearest
+    ones."""
     for title, by_method in _angles(result):
         for name, bins in by_method.items():
             (near, at_near, _), (far, at_far, _) = bins[0], bins[-1]
@@ -92,8 +92,8 @@ def falls_with_angle(result: Result) -> Iterator[Finding]:
 
 
 def ahead_at_every_angle(result: Result) -> Iterator[Finding]:
-    """Check that in every bin of angles H-NeRF is better than each other method; where it was tried and has no scores,
-    it is not."""
+    """Check that in every bin of angles H-NeRF is better than each other method. Where H-NeRF was run and has no
+    scores, the claim is not supported."""
     for title, by_method in _angles(result):
         for first in _h_nerf(result, result["variants"][title]["methods"]):
             for name in _others(result, by_method):
@@ -106,7 +106,7 @@ def ahead_at_every_angle(result: Result) -> Iterator[Finding]:
 
 
 def no_trend_with_pose(result: Result) -> Iterator[Finding]:
-    """Check that H-NeRF's images of novel poses do not depend on their distance from the training poses."""
+    """Check that the scores of H-NeRF's images of novel poses do not depend on the distance from the training poses."""
     for title, variant in result["variants"].items():
         found = scatter_points(variant, "novel_pose", "pose_distance_deg")
         for points in [found[name] for name in _h_nerf(result, found)]:
@@ -143,17 +143,17 @@ CHECKS: dict[str, Callable[[Result], Iterator[Finding]]] = {
 
 
 def _h_nerf(result: Result, names: Collection[str]) -> list[str]:
-    """Return the preset of H-NeRF that claims are about; none if it is not among the methods."""
+    """Return the H-NeRF preset that claims are about; none if it is not among the methods."""
     return [name for name in result["own"][:1] if name in names]
 
 
 def _others(result: Result, names: Iterable[str]) -> list[str]:
-    """Return those of the methods that are no presets of H-NeRF."""
+    """Return the methods that are not presets of H-NeRF."""
     return [name for name in names if name not in result["own"]]
 
 
 def _falls(key: str, before: float, after: float) -> bool:
-    """Return whether a score is worse than the one before by more than another seed may cost."""
+    """Return whether a score is worse than the previous one by more than another seed may cost."""
     return after < before - SEED_DB if key == PSNR else after > SEED_RATIO * before
 
 

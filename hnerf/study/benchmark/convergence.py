@@ -1,11 +1,12 @@
-"""Convergence of a method: trainings that each take twice as long as the one before, until one gains nothing."""
+"""Convergence of a method: successive trainings, each twice as long as the one before, until the score no longer
+improves."""
 
 from collections.abc import Sequence
 
 from hnerf.study.benchmark.curves import Point
 
 FIRST_S = 10.0
-MIN_S = 600.0  # before it no curve is flat: young fields stagnate before they find the person
+MIN_S = 600.0  # earlier, no curve counts as flat: young fields stagnate before they find the person
 FLAT_DB = 0.1
 LAST_SHARE = 1 / 3  # share of the time in which a flat curve gains less than FLAT_DB
 CURVE_PROTOCOL = (

@@ -9,8 +9,8 @@ Point = tuple[float, float]
 
 
 def pareto_front(points: Mapping[str, Point]) -> list[str]:
-    """Return the names of the points (cost, accuracy) that no other dominates, cheapest first: none costs at most as
-    much and is at least as accurate, and better in one of the two."""
+    """Return the names of the points (cost, accuracy) that no other dominates, cheapest first. A point dominates
+    another if it costs no more and is no less accurate, and is better in at least one of the two."""
     front = [
         name
         for name, (cost, accuracy) in points.items()
@@ -20,9 +20,8 @@ def pareto_front(points: Mapping[str, Point]) -> list[str]:
 
 
 def seconds_to_reach(curve: Sequence[Point], level: float) -> float | None:
-    """Return when a curve of (seconds, score) first reaches a level, linear in log seconds between its points; None
-    if it never does. A curve that starts above the level reaches it at its first point: nothing is known of earlier
-    times."""
+    """Return when a curve of (seconds, score) first reaches a level, interpolated linearly in log seconds; None if it
+    never does. A curve that starts above the level reaches it at its first point, since earlier times are unknown."""
     for (s, v), (t, w) in zip(((0.0, -math.inf), *curve), curve, strict=False):
         if w >= level:
             if not math.isfinite(v):
@@ -32,8 +31,8 @@ def seconds_to_reach(curve: Sequence[Point], level: float) -> float | None:
 
 
 def value_at(curve: Sequence[Point], seconds: float) -> float | None:
-    """Return a curve of (seconds, score) at a time, linear in log seconds between its points and constant after the
-    last; None before the first."""
+    """Return the value of a curve of (seconds, score) at a time, interpolated linearly in log seconds and constant
+    after the last point; None before the first."""
     if not curve or seconds < curve[0][0]:
         return None
     times, values = zip(*curve, strict=True)
@@ -41,15 +40,15 @@ def value_at(curve: Sequence[Point], seconds: float) -> float | None:
 
 
 def bin_edges(clouds: Iterable[Sequence[Point]], bins: int) -> list[float]:
-    """Return bins + 1 equally spaced edges from the smallest to the largest x of all points; none if there are no
-    points."""
+    """Return bins + 1 equally spaced edges from the smallest to the largest x of all points; an empty list if there are
+    no points."""
     x = [x for points in clouds for x, _ in points]
     return np.linspace(min(x), max(x), bins + 1).tolist() if x else []
 
 
 def bin_means(points: Sequence[Point], edges: Sequence[float]) -> list[tuple[float, float, int]]:
-    """Return mean x, mean y and number of the points between each two edges, for bins that have any; the last edge is
-    included."""
+    """Return mean x, mean y and the number of points between each two successive edges, for bins that are not empty.
+    The last edge is inclusive."""
     found = np.array(points)
     place = np.digitize(found[:, 0], edges[1:-1])
     parts = [found[place == k] for k in range(len(edges) - 1)]

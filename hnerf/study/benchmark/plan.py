@@ -13,12 +13,12 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.study.benchmark.convergence import FIRST_S
 
 STUDIES = CONFIGS / "benchmark"
-UNLIMITED_STEPS = 1_000_000  # the time limit ends a training before
-FIRST_SNAPSHOT_S = 15.0  # for trainings without a time limit to halve
+UNLIMITED_STEPS = 1_000_000  # never reached: the time limit ends a training first
+FIRST_SNAPSHOT_S = 15.0  # for trainings without a time limit that could be halved
 
 
 class CapturePart(Section):
-    """Part of a capture. cameras, frames: of training, either how many or which; None is all."""
+    """Part of a capture. cameras, frames: those of training, as a number or a list; None keeps all."""
 
     cameras: PositiveInt | tuple[str, ...] | None = None
     frames: PositiveInt | tuple[int, ...] | None = None
@@ -27,8 +27,8 @@ class CapturePart(Section):
     def select(self, capture: Capture) -> tuple[tuple[str, ...] | None, tuple[int, ...] | None, tuple[int, ...] | None]:
         """Return the training cameras, training frames and novel-pose frames to keep, None for all.
 
-        Fewer cameras are taken at equal steps of the capture's order, frames evenly spaced over time. Raises InputError
-        if the capture has fewer, or none of that name.
+        A number of cameras is taken at equal steps in the capture's order, a number of frames evenly spaced over time.
+        Raises InputError if the capture has fewer, or none of that name.
         """
         cameras, frames = self.cameras, self.frames
         if isinstance(cameras, int):
@@ -44,7 +44,7 @@ class CapturePart(Section):
 
 
 class Variant(CapturePart):
-    """Part of a capture, and the methods of the study that are run on it; all if none are named."""
+    """Part of a capture, and the methods of the study to run on it; all if none are named."""
 
     methods: tuple[str, ...] = ()
 
@@ -65,7 +65,7 @@ class Claim(Section):
 
 
 class ScoringSettings(Section):
-    """How many held-out images are rendered and how many surfaces meshed. split: of curves and charts."""
+    """How many held-out images are rendered and how many surfaces are meshed. split: of curves and charts."""
 
     split: Literal["novel_view", "novel_pose"] = "novel_view"
     images: int | None = Field(default=None, ge=1)  # per split, of the finished model; None: all
@@ -76,17 +76,17 @@ class ScoringSettings(Section):
 
 
 class BenchmarkStudy(Section):
-    """A benchmark. methods: presets, of which claims are about the first of H-NeRF; seconds: limit of every training,
-    None for each preset's own end; snapshots: how many are scored before it; until_flat: instead of them, longer and
-    longer trainings up to `seconds` (hnerf/study/benchmark/convergence.py)."""
+    """A benchmark. methods: presets; claims are about the first one of H-NeRF; seconds: time limit of every training,
+    None for each preset's own end; snapshots: how many are scored before the end; until_flat: instead of snapshots,
+    longer and longer trainings up to `seconds` (hnerf/study/benchmark/convergence.py)."""
 
     title: str
-    notes: tuple[str, ...] = ()  # for the reader, such as what is left out
+    notes: tuple[str, ...] = ()  # for the reader, for example about what is left out
     claims: tuple[Claim, ...] = ()
     seconds: float | None = Field(default=None, gt=0)
     snapshots: int = Field(default=4, ge=0, le=12)
     until_flat: bool = False
-    sweep: Literal["cameras", "frames"] | None = None  # in what the variants differ, for a chart of its own
+    sweep: Literal["cameras", "frames"] | None = None  # what differs between the variants; drawn as a separate chart
     methods: tuple[str, ...] = Field(min_length=1)
     variants: dict[str, Variant] = Field(min_length=1)
     scoring: ScoringSettings = ScoringSettings()
@@ -105,9 +105,9 @@ class BenchmarkStudy(Section):
         return self
 
     def settings(self, method: str, seconds: float | None = None) -> Settings:
-        """Return the settings of all stages; training stops after `seconds`, by default the study's, and saves
-        snapshots on the way. The steps of the preset end H-NeRF only, being how long it needs; for a compared method
-        the question is what it reaches in its time."""
+        """Return the settings of all stages. Training stops after `seconds`, by default the study's, and saves
+        snapshots on the way. The preset's number of steps limits H-NeRF only, since it says how long H-NeRF needs; for
+        a compared method, the question is what it reaches in its time."""
         settings, seconds = load_settings(method), seconds or self.seconds
         training = {"seconds": seconds, "snapshots_s": snapshot_times_s(seconds, self.snapshots)}
         if seconds and not settings.training.field.tunes_poses:
@@ -115,13 +115,13 @@ class BenchmarkStudy(Section):
         return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
 
     def own_methods(self) -> list[str]:
-        """Return which methods are presets of H-NeRF."""
+        """Return the methods that are presets of H-NeRF."""
         return [name for name in self.methods if load_settings(name).training.field.tunes_poses]
 
     def restricted_to(self, names: Sequence[str], seconds: float | None) -> "BenchmarkStudy":
-        """Return the study with these methods only, in its own order, and this time limit; a method that it does not
-        have is run on every variant. Without names it keeps its methods, and without a limit its own. Raises InputError
-        for a limit below the first training of a study until curves are flat."""
+        """Return the study with these methods only, in the study's order, and this time limit. A method that the study
+        does not have is run on every variant. Without names, the study keeps its methods, and without a limit its own
+        limit. Raises InputError if the limit is below the first training of a study until curves are flat."""
         if self.until_flat and seconds and seconds < FIRST_S:
             raise InputError(f"--seconds {seconds:g}: the first training of this study takes {FIRST_S:g} s; give more")
         further = dict.fromkeys(name for name in names if name not in self.methods)
@@ -136,7 +136,7 @@ class BenchmarkStudy(Section):
 
 
 def load_study(name: str) -> BenchmarkStudy:
-    """Load a study by its name or its file's path. Raises InputError, one line, if there is none or a key is not
+    """Load a study by its name or its file's path. Raises InputError, in one line, if there is none or a key is not
     allowed."""
     path = named_file(name, STUDIES, "study", "studies")
     study = validated(BenchmarkStudy, read_yaml(path), path)
@@ -148,7 +148,7 @@ def load_study(name: str) -> BenchmarkStudy:
 
 
 def snapshot_times_s(seconds: float | None, count: int) -> tuple[float, ...]:
-    """Return the time limit halved `count` times over, in ascending order; without a limit, doublings of 15 s."""
+    """Return the time limit halved 1 to `count` times, in ascending order; without a limit, doublings of 15 s."""
     if seconds is None:
         return tuple(FIRST_SNAPSHOT_S * 2**k for k in range(count))
     return tuple(seconds / 2**k for k in range(count, 0, -1))

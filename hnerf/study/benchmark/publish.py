@@ -1,4 +1,4 @@
-"""Files of a benchmark's result: JSON, CSV, Markdown, and charts beside them."""
+"""Files of a benchmark's result: JSON, CSV, Markdown and charts, next to each other."""
 
 import json
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from hnerf.study.benchmark.claims import claim_lines
 PSNR, CHAMFER = "held-out PSNR, dB", "Chamfer distance"
 ANGLE = "angle from the nearest training camera, degrees"
 POSE = "angle from the nearest training pose, degrees a joint"
-TRAINING_DISTANCE_PANELS = (  # distance, split, score, labels of distance and score
+TRAINING_DISTANCE_PANELS = (  # distance, split, score, labels of the distance and the score
     ("view_angle_deg", "novel_view", "psnr", ANGLE, f"{PSNR} (an image)"),
     ("pose_distance_deg", "novel_pose", "psnr", POSE, f"{PSNR} (an image)"),
     ("pose_distance_deg", "novel_pose", "chamfer_mm", POSE, f"{CHAMFER} (a surface), mm"),
@@ -22,12 +22,12 @@ SWEEP_FIGURES = {"psnr": PSNR, "geometry.chamfer_l2_e3": f"{CHAMFER}, 1e-3 m²"}
 
 
 def table_of(result: Mapping[str, Any], store: Path) -> Path:
-    """Return `<store>/benchmark/<subject>-<study>.md`, its study ending in "-part" if it is one."""
+    """Return `<store>/benchmark/<subject>-<study>.md`; the study's name ends in "-part" if only part of it was run."""
     return store / "benchmark" / f"{result['subject']}-{result['study']}{'-part' if result['part'] else ''}.md"
 
 
 def publish(result: dict[str, Any], store: Path) -> Path:
-    """Write a result's table, with CSV and JSON beside it, and its PNGs anew; return the table's path."""
+    """Write a result's table, with CSV and JSON next to it, and redraw its PNGs; return the table's path."""
     table = table_of(result, store)
     table.parent.mkdir(parents=True, exist_ok=True)
     drawn = draw_charts(result, store, table)
@@ -38,7 +38,7 @@ def publish(result: dict[str, Any], store: Path) -> Path:
 
 
 def draw_charts(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
-    """Draw every chart that the result has scores for; return their paths."""
+    """Draw every chart for which the result has scores; return their paths."""
     method_styles, caption, variants = charts.styles(result["methods"]), results.caption(result), result["variants"]
     paths = {name: table.with_name(f"{table.stem}{name}.png") for name in ("", "-sweep", "-nearness", "-pictures")}
     drawn = []
@@ -78,7 +78,7 @@ def draw_charts(result: Mapping[str, Any], store: Path, table: Path) -> list[Pat
 
 
 def picture_rows(title: str, variant: Mapping[str, Any], store: Path) -> list[tuple[str, list[tuple[str, Any]]]]:
-    """Return a row for each pictured image: the truth, and the rendering of each method that has one, with its PSNR."""
+    """Return a row for each image shown: the ground truth, and each method's rendering of it, if any, with its PSNR."""
     found: dict[str, list[tuple[str, Any]]] = {}
     for name, scores in results.scored_methods(variant).items():
         folder = store / scores["folder"] / "pictures"

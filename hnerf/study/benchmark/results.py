@@ -1,6 +1,7 @@
-"""A benchmark's result as tables, Markdown for people and CSV for spreadsheets, and as the data of its charts.
+"""A benchmark's result as tables (Markdown for people, CSV for spreadsheets), and as the data of its charts.
 
 A result is a plain tree, as in the JSON file:
+
     {subject, study, part: whether methods or seconds are not the study's, title, notes, claims, seconds, until_flat,
      sweep, methods: [name], own: [name of an H-NeRF preset],
      variants: {title: {cameras, frames,
@@ -46,7 +47,7 @@ COSTS = {  # by key in a training's report
     "model_mib": ("model, MiB", "{:.1f}"),
 }
 NEAR_BEST_DB = 1.0
-BINS = 6  # of the distance from the training data
+BINS = 6  # over the distance from the training data
 AFTER_S = {60.0: "60 s", 600.0: "10 min", 3600.0: "1 h"}
 # Why a method was not trained longer.
 END_REASONS = {"flat": "flat", "limit": "out of time", "steps": "its steps are done"}
@@ -68,7 +69,7 @@ def psnr_curves(variant: Mapping[str, Any]) -> dict[str, list[Point]]:
 
 
 def frame_points(variant: Mapping[str, Any]) -> dict[str, Point]:
-    """Return, by method, seconds a frame at the smallest size that was timed, and PSNR of the finished model."""
+    """Return, by method, the seconds per frame at the smallest timed size, and the PSNR of the finished model."""
     points = {}
     for name, scores in scored_methods(variant).items():
         seconds, psnr = scores["frame_seconds"], scores[scores["split"]]["psnr"]
@@ -78,7 +79,7 @@ def frame_points(variant: Mapping[str, Any]) -> dict[str, Point]:
 
 
 def trivial_psnr(variant: Mapping[str, Any]) -> dict[str, float]:
-    """Return the PSNR of trivial pictures over the images of the curves, by title; none if no image could be scored."""
+    """Return the PSNR of trivial images over the images of the curves, by title; empty if no image could be scored."""
     finals = [scores["curve"][-1] for scores in scored_methods(variant).values() if scores["curve"]]
     return {title: end[key] for end in finals[:1] for key, title in TRIVIAL_PICTURES.items() if end["psnr"] is not None}
 
@@ -89,7 +90,7 @@ def heading(title: str, variant: Mapping[str, Any]) -> str:
 
 
 def smallest_timed_px(result: Mapping[str, Any]) -> str:
-    """Return the smallest image size that was timed, by its longest side."""
+    """Return the smallest timed image size, as the length of its longest side."""
     return min((size for variant in result["variants"].values() for size in _sizes(variant)), key=int)
 
 
@@ -105,7 +106,7 @@ def sweep_curves(result: Mapping[str, Any], key: str = "psnr") -> dict[str, list
 
 def scatter_points(variant: Mapping[str, Any], split: str, x: str, y: str = "psnr") -> dict[str, list[Point]]:
     """Return, by method, the PSNR of every image of a split, or a score of its surfaces such as "chamfer_mm", over the
-    distance of each from training, such as "view_angle_deg"."""
+    distance of each from the training data, such as "view_angle_deg"."""
     found = {}
     for name, scores in scored_methods(variant).items():
         rows = scores[split]["per_image"] if y == "psnr" else (scores[split]["geometry"] or {}).get("per_surface", [])
@@ -114,12 +115,12 @@ def scatter_points(variant: Mapping[str, Any], split: str, x: str, y: str = "psn
 
 
 def end_reasons(variant: Mapping[str, Any]) -> dict[str, str]:
-    """Return, for each method that was trained until its curve was flat, why it was not trained for longer."""
+    """Return, for each method that was trained until its curve was flat, why it was not trained longer."""
     return {name: END_REASONS[scores["ended"]] for name, scores in scored_methods(variant).items() if "ended" in scores}
 
 
 def near_best_seconds(variant: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return when each method came within 1 dB of the best final PSNR of a variant; None if it never did."""
+    """Return when each method came within 1 dB of a variant's best final PSNR; None if it never did."""
     curves = psnr_curves(variant)
     best = max((curve[-1][1] for curve in curves.values()), default=0.0)
     return {name: seconds_to_reach(curve, best - NEAR_BEST_DB) for name, curve in curves.items()}
@@ -136,7 +137,8 @@ def caption(result: Mapping[str, Any]) -> str:
 
 
 def as_markdown(result: Mapping[str, Any], pictures: list[str], claims: list[str]) -> str:
-    """Format the whole result for people. pictures: names of files beside the text; claims: lines of claims.py."""
+    """Format the whole result for people. pictures: names of image files next to the text; claims: lines of
+    claims.py."""
     lines = [f"# {result['title']}: {result['subject']}", "", caption(result), ""]
     lines += [f"- {note}" for note in result["notes"]] + [""] * bool(result["notes"])
     lines += [f"{markdown_image(name)}\n" for name in pictures] + claims + [""] * bool(claims)
@@ -181,8 +183,8 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
 
 
 def _counts(variant: Mapping[str, Any]) -> str:
-    """Return on how many images and surfaces a variant's scores rest, as a sentence with a space before it; nothing if
-    there are no scores. A method that lacks some has fewer."""
+    """Return how many images and surfaces a variant's scores are based on, as a sentence that starts with a space;
+    empty if there are no scores. Methods that lack some scores have fewer."""
     found = list(scored_methods(variant).values())
     if not found:
         return ""
@@ -196,12 +198,12 @@ def _counts(variant: Mapping[str, Any]) -> str:
 
 
 def cell(scores: Mapping[str, Any], key: str, form: str) -> str:
-    """Return a score for every split that can have it, in the order of CELL_LEGEND."""
+    """Return the score for every split that can have it, in the order of CELL_LEGEND."""
     return " / ".join(shown(pick(scores[split], key), form) for split in splits_of(key))
 
 
 def splits_of(key: str) -> tuple[str, ...]:
-    """Return the splits that have a score of COLUMNS: only the primary ones have surfaces."""
+    """Return the splits that have a score of COLUMNS; only the primary splits have surfaces."""
     return PRIMARY_SPLITS if key.startswith("geometry.") else tuple(SPLITS)
 
 
@@ -214,7 +216,7 @@ def _timeline(variant: Mapping[str, Any]) -> list[str]:
     lines += head(["method", *AFTER_S.values(), "at its end", "best", "ended"])
     for name, curve in curves.items():
         (end_s, at_end), (best_s, best) = curve[-1], max(curve, key=lambda point: point[1])
-        known_s = end_s if why[name] == END_REASONS["limit"] else math.inf  # a longer training would reach more
+        known_s = end_s if why[name] == END_REASONS["limit"] else math.inf  # a longer training would score higher
         values = [value_at(curve, seconds) if seconds <= known_s else None for seconds in AFTER_S]
         cells = [shown(value, "{:.2f}") for value in values]
         lines.append(
@@ -224,7 +226,7 @@ def _timeline(variant: Mapping[str, Any]) -> list[str]:
 
 
 def as_csv(result: Mapping[str, Any]) -> str:
-    """Return a row for each method of each variant, one score a cell; empty if there is none."""
+    """Return a row for each method of each variant, with one score per cell; a missing score is an empty cell."""
     sizes = sorted({size for variant in result["variants"].values() for size in _sizes(variant)}, key=int)
     keys = [f"{split}.{key}" for split in SPLITS for key in COLUMNS if split in splits_of(key)]
     keys += [f"training.{key}" for key in COSTS]
@@ -240,7 +242,7 @@ def as_csv(result: Mapping[str, Any]) -> str:
 
 
 def missing_figures(scores: Mapping[str, Any]) -> Iterator[str]:
-    """Yield why splits lack scores; a reason common to all novel poses is given once."""
+    """Yield the reasons why splits lack scores; a reason common to all novel poses is given once."""
     for split, name in SPLITS.items():
         if "reason" in scores[split] and (split in PRIMARY_SPLITS or "reason" not in scores[ANIMATED]):
             yield f"no images of {name}: {scores[split]['reason']}"

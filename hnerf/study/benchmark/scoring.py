@@ -1,4 +1,5 @@
-"""Scores of a training: its snapshots and its end scored on held-out images and surfaces, and rendering times."""
+"""Scores of a training: its snapshots and its final model, scored on held-out images and surfaces, and rendering
+times."""
 
 import json
 import logging
@@ -30,8 +31,8 @@ from hnerf.study.machine import machine
 
 log = logging.getLogger("hnerf.study")
 
-PICTURES = 2  # of each training
-REPEATS = 3  # of a timed rendering, of which the median counts
+PICTURES = 2  # images shown of each training
+REPEATS = 3  # of a timed rendering; their median counts
 SLOW_S = 10.0  # an image that takes this long is timed once
 SCORING_PROTOCOL = (
     "Training seconds: the trainer's own clock from its first step on, without reading the capture and without setup "
@@ -46,7 +47,7 @@ SCORING_PROTOCOL = (
 @dataclass(frozen=True)
 class ScoringScene:
     """What trainings are scored against: the capture with calibrated cameras, the body as fitted before training, and
-    the truth."""
+    the ground truth."""
 
     capture: Capture
     fitted: BodyFit
@@ -55,9 +56,9 @@ class ScoringScene:
 
 
 def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> Scores:
-    """Write `scores.json`, renderings and meshes into `out`; return what scores.json holds.
+    """Write `scores.json`, renderings and meshes into `out`; return the content of scores.json.
 
-    training: the training's folder. A score that is not available is null, with a reason beside it.
+    training: the training's folder. A score that is not available is null, with a reason next to it.
     """
     avatar, split = load_avatar(training, scene.device), settings.split
     unavailable = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
@@ -86,7 +87,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
 
 
 def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> EndScores:
-    """Write `scores.json` with training's report and only the last point of its curve; return what it holds."""
+    """Write `scores.json` with the training's report and only the last point of its curve; return its content."""
     avatar, split = load_avatar(training, scene.device), settings.split
     scored = scene.capture.test_cameras and not reason_unavailable(split, training)
     rows = curve(scene, split, training, avatar, settings, out) if scored else []
@@ -98,7 +99,7 @@ def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, ou
 def curve(
     scene: ScoringScene, split: str, training: Path, finished: Avatar, settings: ScoringSettings, out: Path
 ) -> list[CurvePoint]:
-    """Return training seconds and scores of every snapshot, and last of the finished field, in order of time."""
+    """Return training seconds and scores of every snapshot and, last, of the finished field, in order of time."""
     end_s = json.loads((training / "report.json").read_text())["field_seconds"]
     taken = {json.loads((f / "settings.json").read_text())["seconds"]: f for f in (training / "snapshots").glob("*")}
     models = [(s, load_avatar(taken[s], scene.device)) for s in sorted(taken) if s < end_s]
@@ -117,8 +118,8 @@ def curve(
 def score_views(
     scene: ScoringScene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path
 ) -> SplitScores:
-    """Score a split's avatar on at most so many images and surfaces, among those with truth, in the format of
-    evaluation; None is all."""
+    """Score a split's avatar on at most this many of the images and surfaces that have ground truth, in the format of
+    the evaluation; None scores all images."""
     views = all_views(scene.capture, split)
     views = evenly_spaced(views_with_mask(views, scene.truth) or views, images or len(views))
     if views and scene.capture.test_cameras:
@@ -134,8 +135,8 @@ def score_views(
 
 
 def write_pictures(scene: ScoringScene, split: str, per_image: list[ImageScores], out: Path) -> list[Picture]:
-    """Write a few scored renderings and the truth, cropped to the person, as `pictures/<k>-{render,truth}.png`; return
-    which."""
+    """Write a few scored renderings and their ground truth, cropped to the person, as
+    `pictures/<k>-{render,truth}.png`; return which ones."""
     chosen = [Picture(camera=row["camera"], frame=row["frame"]) for row in evenly_spaced(per_image, PICTURES)]
     for k, row in enumerate(chosen):
         box = frame_person(scene.truth.mask(**row))
@@ -146,8 +147,9 @@ def write_pictures(scene: ScoringScene, split: str, per_image: list[ImageScores]
 
 
 def add_training_distances(scene: ScoringScene, split: str, found: SplitScores) -> None:
-    """Add to each image's and surface's scores the distance of its view and its pose from those of training, by the
-    body as fitted: the same for all methods, whatever each has tuned."""
+    """Add to the scores of each image and surface the distances of its view and its pose from those of training. They
+    are computed from the body as fitted, so that they are the same for all methods, however each has tuned the
+    poses."""
     capture, body = scene.capture, scene.fitted
     apart_deg = pose_distances_deg(body, split_frames(capture, split), capture.train_frames)
     vertices_m = body.vertices_m().cpu().numpy()
@@ -162,7 +164,7 @@ def add_training_distances(scene: ScoringScene, split: str, found: SplitScores) 
 
 
 def frame_seconds(avatar: Avatar, camera: Camera, frame: int, side_px: int) -> float:
-    """Return the median seconds of rendering a fitted pose to an image with this longest side."""
+    """Return the median time in seconds to render a fitted pose as an image with this longest side."""
     resized = camera.scaled(side_px / max(camera.size_px))
     pose = avatar.body.pose(frame)
     seconds: list[float] = []

@@ -10,15 +10,16 @@ from hnerf.geometry.camera import Camera
 
 
 def view_angle_deg(camera: Camera, others: Iterable[Camera], middle_m: np.ndarray) -> float:
-    """Return the angle at a world point (3,) between a camera and the nearest in angle of others."""
+    """Return the angle, seen from a world point (3,), between a camera and the one of `others` that is nearest in
+    angle."""
     towards = _unit(camera.centre_m - middle_m)
     cosines = [towards @ _unit(other.centre_m - middle_m) for other in others]
     return float(np.rad2deg(np.arccos(np.clip(max(cosines), -1, 1))))
 
 
 def pose_distances_deg(body: BodyFit, frames: Iterable[int], others: Iterable[int]) -> dict[int, float]:
-    """Return, for each frame, the distance of its pose from the nearest of other frames: the mean over free joints of
-    the angle of the relative rotation. Walking or turning as a whole adds nothing."""
+    """Return, for each frame, the distance of its pose from the nearest pose of the other frames: the mean angle of the
+    relative rotations of free joints. Walking, or turning the whole body, does not count."""
     turns = rotation_from_axis_angle(body.theta[:, body.rig.free].double()).cpu()
     known = turns[[body.index(frame) for frame in others]]
     # |A - B| of two rotations is sqrt(8) times the sine of half the angle between them.

@@ -15,17 +15,17 @@ T = TypeVar("T")
 
 
 def keep_cameras(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
-    """Keep `count` training cameras, drawn at random. Raises NotApplicableError if there are no more than that."""
+    """Keep `count` training cameras, drawn at random. Raises NotApplicableError if there are no more than `count`."""
     subset(capture, out, _random_subset(capture.name, "cameras", capture.train_cameras, count, rng), None, None)
 
 
 def keep_frames(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
-    """Keep `count` training frames, drawn at random. Raises NotApplicableError if there are no more than that."""
+    """Keep `count` training frames, drawn at random. Raises NotApplicableError if there are no more than `count`."""
     subset(capture, out, None, _random_subset(capture.name, "frames", capture.train_frames, count, rng), None)
 
 
 def rotate_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, out: Path) -> None:
-    """Rotate one training camera's extrinsics about its centre and a random axis; its images stay."""
+    """Rotate the extrinsics of one training camera about its centre and a random axis; its images stay the same."""
     require_several_cameras(capture)
     camera = capture.cameras[str(rng.choice(capture.train_cameras))]
     axis = rng.normal(size=3)
@@ -35,8 +35,8 @@ def rotate_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, 
 
 
 def delay_camera(capture: Capture, frames: float, rng: np.random.Generator, out: Path) -> None:
-    """Delay one random training camera: at each frame it shows its image of that many frames before, and until then its
-    first image; masks and what was detected are those of the image."""
+    """Delay one random training camera: at each frame it shows its image of `frames` frames earlier, or its first image
+    if there is none. Masks and detections are delayed with the image."""
     if not 1 <= round(frames) < len(capture.frames):
         raise NotApplicableError(f"{capture.name}: has {len(capture.frames)} frames; none can be delayed by {frames:g}")
     require_several_cameras(capture)

@@ -31,25 +31,25 @@ class Degradation(Section):
 
     @property
     def rng(self) -> Rng:
-        """Return a generator with the same random numbers for the same seed, whatever the strength."""
+        """Return a generator that gives the same random numbers for the same seed, whatever the strength."""
         return np.random.default_rng(self.seed)
 
     def apply(self, *what: Any, **where: Any) -> Any:
-        """Write a degraded capture, normalised like the one given, into a folder `out`, for clothing with its ground
-        truth; or return degraded masks of the same views, given masks and their capture, or a body fit with degraded
+        """Write a degraded capture into a folder `out`, normalised like the given one; for clothing, with its ground
+        truth. Or return degraded masks of the same views, given masks and their capture, or a body fit with degraded
         poses or shape."""
         change = KINDS[self.kind].change
-        assert change is not None  # degradations of capture, clothing, masks and fit have one
+        assert change is not None  # degradations of capture, clothing, masks and fit have a function
         return change(*what, self.strength, self.rng, **where)
 
 
 @dataclass(frozen=True)
 class DegradationKind:
-    """A kind of degradation. target: what it changes; "clothing" is the capture once its body is fitted, "poses" those
-    that a finished avatar is shown in. label: with the strength's unit.
+    """A kind of degradation. target: what it changes; "clothing" is the capture after its body was fitted, "poses" are
+    those in which a finished avatar is shown. label: includes the strength's unit.
 
     change: the function that writes a changed capture into a folder, or changes masks or a fitted body. Strengths run
-    from `neutral`, at which nothing would change, to `limit`, inclusive; integer: whether they are counts.
+    from `neutral`, which would change nothing, to `limit`, inclusive; integer: whether they are counts.
     """
 
     target: Target
@@ -96,7 +96,7 @@ KINDS = {
 
 
 def degrade_settings(settings: TrainingSettings, degradation: Degradation) -> TrainingSettings:
-    """Multiply every learning rate by the strength: of the poses and of the method's own networks and grids."""
+    """Multiply every learning rate by the strength: those of the poses and of the method's own networks and grids."""
     rates = settings.field.model_dump()
     own = {name: value * degradation.strength for name, value in rates.items() if name.endswith("learning_rate")}
     pose_learning_rate = settings.pose_learning_rate * degradation.strength

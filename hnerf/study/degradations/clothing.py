@@ -1,6 +1,6 @@
-"""Clothing that no body model expresses, drawn into a capture: a wide skirt, or long hair.
+"""Clothing that no body model can represent, drawn into a capture: a wide skirt, or long hair.
 
-Both move independently of the body: the skirt spans both thighs and its folds run around it, the hair hangs down and
+Both move independently of the body: the skirt spans both thighs and its folds run around it; the hair hangs down and
 sways. They are drawn over every image, in front of or behind the body that was fitted to the good capture, and over the
 ground truth.
 """
@@ -26,8 +26,8 @@ Rng = np.random.Generator
 NOSE, R_HIP, R_KNEE, L_HIP, L_KNEE, R_EAR, L_EAR = 0, 9, 10, 12, 13, 17, 18  # BODY_25
 RING_VERTICES, RINGS = 64, 24  # of a tube
 ANGLES = 2 * np.pi * np.arange(RING_VERTICES)[:, None] / RING_VERTICES
-FOLDS, FOLD_DEPTH = 8, 0.3  # of the skirt; depth as a share of the hem's distance
-# Of hair: offset behind the head, width and thickness in ear distances; backward slope in metres per metre of length.
+FOLDS, FOLD_DEPTH = 8, 0.3  # of the skirt; the depth is a share of the hem's distance
+# Of the hair: offset behind the head, width and thickness in ear distances; backward slope in metres per metre length.
 BACK, FALLS_BACK, WIDTH, THICKNESS = 0.55, 0.15, 0.65, 0.35
 SWAY = 0.15  # amplitude as a share of the hair's length
 STEP_RAD = 0.4  # standard deviation of the phase step of folds and sway from frame to frame
@@ -37,7 +37,7 @@ HAIR = np.array([[0.20, 0.12, 0.07], [0.30, 0.19, 0.11]])  # two colours of the 
 
 @dataclass(frozen=True)
 class Garment:
-    """A closed tube in every frame. vertices_m (n, RINGS * RING_VERTICES + 2, 3), the last two in the middle of its
+    """A closed tube in every frame. vertices_m (n, RINGS * RING_VERTICES + 2, 3): the last two are the centres of its
     ends; pattern: the two colours (2, 3) of its checks."""
 
     vertices_m: np.ndarray
@@ -63,7 +63,7 @@ class Garment:
 
     @property
     def colours(self) -> np.ndarray:
-        """Return the colours of vertices, (V, 3): checks."""
+        """Return the vertices' colours, (V, 3), in a check pattern."""
         ring, k = np.meshgrid(np.arange(RINGS), np.arange(RING_VERTICES), indexing="ij")
         which = (ring // 4 + k // 8) % 2
         return self.pattern[[*which.ravel(), 0, 0]]
@@ -71,7 +71,7 @@ class Garment:
 
 @dataclass(frozen=True)
 class LitGarment:
-    """A garment in one frame, lit, with the body that occludes part of it; for `render_person`."""
+    """A lit garment in one frame, with the body that occludes part of it; for `render_person`."""
 
     vertices_m: np.ndarray
     faces: np.ndarray
@@ -80,7 +80,7 @@ class LitGarment:
 
     @staticmethod
     def over_body(garment: Garment, row: int, body_m: np.ndarray, body_faces: np.ndarray, up: str) -> "LitGarment":
-        """Return the garment in frame `row`, lit, over the body's vertices body_m (V, 3) of the same frame."""
+        """Return the lit garment in frame `row`, over the body's vertices body_m (V, 3) of the same frame."""
         vertices_m, faces = garment.vertices_m[row], garment.faces
         both = mesh_on_cpu(np.concatenate([vertices_m, body_m]), np.concatenate([faces, body_faces + len(vertices_m)]))
         directions, strength = dome_lights()
@@ -92,19 +92,19 @@ class LitGarment:
         return LitGarment(vertices_m, faces, (garment.colours * light[:, None]).clip(0, 1), both)
 
     def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
-        """Return the first hits of rays from one origin (3,) along unit directions (N, 3); none where the body comes
-        first."""
+        """Return the first hits of rays from one origin (3,) along unit directions (N, 3); no hit where the body is in
+        front."""
         hits = cast(self.both, origin_m, directions)
         return dataclasses.replace(hits, face=np.where(hits.face < len(self.faces), hits.face, -1))
 
     def colours(self, hits: RayHits) -> np.ndarray:
-        """Return the lit colours in [0, 1] of those rays that hit, (M, 3)."""
+        """Return the lit colours in [0, 1] of the rays that hit, (M, 3)."""
         return hits.interpolate(self.colour, self.faces)
 
 
 def skirt(keypoints_m: np.ndarray, up: np.ndarray, flare_m: float, rng: Rng) -> Garment:
-    """Return a skirt from the hips to the knees of keypoints (n, 25, 3), around both thighs; flare_m: how far its hem
-    stands off them."""
+    """Return a skirt around both thighs, from the hips to the knees of keypoints (n, 25, 3). flare_m: distance of its
+    hem from the thighs."""
     right_hip, left_hip, right_knee, left_knee = (keypoints_m[:, k] for k in (R_HIP, L_HIP, R_KNEE, L_KNEE))
     width_m = float(np.linalg.norm(right_hip - left_hip, axis=1).mean())
     hips_m, knees_m = (right_hip + left_hip) / 2, (right_knee + left_knee) / 2
@@ -120,7 +120,8 @@ def skirt(keypoints_m: np.ndarray, up: np.ndarray, flare_m: float, rng: Rng) -> 
 
 
 def long_hair(keypoints_m: np.ndarray, up: np.ndarray, length_m: float, rng: Rng) -> Garment:
-    """Return hair of this length down from the back of the head, between the ears of keypoints (n, 25, 3); up (3,)."""
+    """Return hair of length length_m that hangs from the back of the head, between the ears of keypoints (n, 25, 3). up
+    (3,)."""
     ears_m = (keypoints_m[:, R_EAR] + keypoints_m[:, L_EAR]) / 2
     head_m = float(np.linalg.norm(keypoints_m[:, R_EAR] - keypoints_m[:, L_EAR], axis=1).mean())
     front, left = _level_axes(keypoints_m[:, NOSE] - ears_m, up)
@@ -141,8 +142,9 @@ def add_clothing(
     rng: Rng,
     out: Path,
 ) -> None:
-    """Write the capture into `out` with a garment, `skirt` or `long_hair`, drawn into every image and mask, and under
-    `ground_truth/` into the truth. Keypoints stay: detectors guess what cloth hides. Board footage is omitted."""
+    """Write the capture into `out` with a garment, `skirt` or `long_hair`, drawn into every image and mask, and into
+    the ground truth under `ground_truth/`. Keypoints stay, since detectors guess what cloth hides. Board footage is
+    omitted."""
     bodies_m, faces = body.vertices_m().double().numpy(), body.rig.faces.numpy()
     rows = [body.index(frame) for frame in capture.frames]
     keypoints_m = body.rig.keypoint_weights.double().numpy() @ bodies_m[rows]
@@ -171,7 +173,7 @@ def add_clothing(
 
 
 def _draw(lit_garment: LitGarment, capture: Capture, truth: GroundTruth, camera: str, frame: int, out: Path) -> None:
-    """Write one image, its given and its detected mask, and its truth if there is one."""
+    """Write one image, its given and its detected mask, and its ground truth, if there is one."""
     rgb, coverage, mask = render_person(lit_garment, capture.cameras[camera])
 
     def over(pixels: np.ndarray) -> np.ndarray:
@@ -194,15 +196,14 @@ def _draw(lit_garment: LitGarment, capture: Capture, truth: GroundTruth, camera:
 
 
 def _phases(frames: int, rng: Rng) -> np.ndarray:
-    """Return phases (frames, 1, 1, 1) in radians: random at first, then a random walk in small steps."""
+    """Return phases (frames, 1, 1, 1) in radians: a random walk in small steps from a random start."""
     steps = rng.normal(0, STEP_RAD, frames)
     steps[0] = rng.uniform(0, 2 * np.pi)
     return steps.cumsum()[:, None, None, None]
 
 
 def _level_axes(towards: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit vectors (n, 3) at right angles to up, (3,) or (n, 3): along `towards` (n, 3), and to the left of
-    it."""
+    """Return unit vectors (n, 3) perpendicular to up, (3,) or (n, 3): along `towards` (n, 3), and to the left of it."""
     level, left = towards - up * ((towards * up).sum(-1) / (up * up).sum(-1))[:, None], np.cross(up, towards)
     return level / _lengths(level), left / _lengths(left)
 

@@ -11,13 +11,13 @@ from hnerf.body.fit_result import BodyFit
 
 
 def add_pose_noise(body: BodyFit, angle_deg: float, rng: np.random.Generator) -> BodyFit:
-    """Add random vectors to the rotation vectors of all free joints of all frames; `angle_deg` is the root mean square
-    of their lengths, and of the turns where joints are straight."""
+    """Add random vectors to the rotation vectors of all free joints in all frames. `angle_deg` is the root mean square
+    of their lengths; for straight joints, it is that of the rotations, too."""
     return dataclasses.replace(body, theta=body.theta + _rotation_noise(body, len(body.frames), angle_deg, rng))
 
 
 def change_shape(body: BodyFit, distance_mm: float, rng: np.random.Generator) -> BodyFit:
-    """Move the shape values in a random direction, so far that resting vertices move by `distance_mm` (root mean
+    """Move the shape values in a random direction, so far that vertices at rest move by `distance_mm` (root mean
     square)."""
     rig = body.rig
     direction = torch.from_numpy(rng.normal(size=len(rig.beta))).to(rig.beta)
@@ -29,7 +29,7 @@ def change_shape(body: BodyFit, distance_mm: float, rng: np.random.Generator) ->
 def extreme_poses(body: BodyFit, angle_deg: float, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Return poses far from those of the body's frames: theta (count, J, 3) and root (count, 4, 4).
 
-    Frames are drawn at random, and every free joint is turned as by `add_pose_noise`.
+    Frames are drawn at random, and every free joint is rotated as in `add_pose_noise`.
     """
     rows = torch.from_numpy(rng.integers(len(body.frames), size=count))
     return body.theta[rows] + _rotation_noise(body, count, angle_deg, rng), body.root[rows]

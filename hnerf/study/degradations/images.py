@@ -1,7 +1,7 @@
-"""Degradations of the training cameras' images. Test cameras stay as they are, so that scores can be compared.
+"""Degradations of the training cameras' images. Test cameras stay the same, so that scores can be compared.
 
-Clean plates are degraded likewise, since the same camera took them. What was detected in the images (keypoints, hands,
-landmarks, person masks) stays, unless pixels move or are hidden.
+Clean plates are degraded in the same way, since the same camera took them. Detections in the images (keypoints, hands,
+landmarks, person masks) stay, unless pixels move or are hidden.
 """
 
 import dataclasses
@@ -18,18 +18,18 @@ PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
 
 def add_noise(capture: Capture, levels: float, rng: np.random.Generator, out: Path) -> None:
-    """Add Gaussian noise of this standard deviation, in levels of 255, independently to every image."""
+    """Add independent Gaussian noise to every image. levels: its standard deviation, in levels of 255."""
     rewrite_images(capture, out, lambda _, rgb: _to_8_bit(rgb + rng.normal(0, levels, rgb.shape)))
 
 
 def blur(capture: Capture, percent: float, rng: np.random.Generator, out: Path) -> None:
-    """Blur images by a Gaussian whose standard deviation is this percentage of their width."""
+    """Blur images with a Gaussian whose standard deviation is this percentage of their width."""
     rewrite_images(capture, out, lambda _, rgb: cv2.GaussianBlur(rgb, (0, 0), percent / 100 * rgb.shape[1]))
 
 
 def vary_exposure(capture: Capture, power: float, rng: np.random.Generator, out: Path) -> None:
     """Multiply the encoded values of training cameras' images by gains from 2^-power to 2^power, evenly spaced in the
-    exponent and assigned at random. A gain of 2 is that of 2.2 stops of light, by sRGB's gamma."""
+    exponent and assigned at random. Because of sRGB's gamma, a gain of 2 corresponds to 2.2 stops of light."""
     require_several_cameras(capture)
     names = rng.permutation(capture.train_cameras)
     gains = dict(zip(names.tolist(), 2 ** np.linspace(-power, power, len(names)), strict=True))
@@ -37,7 +37,7 @@ def vary_exposure(capture: Capture, power: float, rng: np.random.Generator, out:
 
 
 def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) -> None:
-    """Resize training cameras' images and masks by a factor, and what was detected in them. Board footage is
+    """Resize the training cameras' images and masks by a factor, together with the detections in them. Board footage is
     omitted."""
     cameras = capture.cameras | {
         name: camera.scaled(scale) for name, camera in capture.cameras.items() if name in capture.train_cameras
@@ -51,7 +51,7 @@ def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) 
     def scaled(camera: str, points: np.ndarray) -> np.ndarray:
         scale = np.array(cameras[camera].size_px) / capture.cameras[camera].size_px
         xy = points[..., :2] * scale + (scale - 1) / 2  # pixel centres are at integers
-        return np.concatenate([xy, points[..., 2:]], -1) * (points[..., 2:] > 0)  # what is unseen stays zero
+        return np.concatenate([xy, points[..., 2:]], -1) * (points[..., 2:] > 0)  # unseen points stay zero
 
     rewrite_images(capture.with_cameras(cameras), out, resized, resized, scaled)
 
@@ -63,9 +63,9 @@ def rewrite_images(
     change_mask: PixelChange = lambda _, mask: mask,
     change_points: PointChange = lambda _, points: points,
 ) -> None:
-    """Copy a capture, changing every image and clean plate of its training cameras by `change(camera, (H, W, 3)
-    uint8)`, every given mask and detected person mask by `change_mask(camera, (H, W) uint8 from 0 to 255)`, and the
-    points detected in any camera by `change_points(camera, (frames, ..., 3))`. Images are JPEG, as written by
+    """Copy a capture with changes. Every image and clean plate of its training cameras is changed by `change(camera,
+    (H, W, 3) uint8)`, every given mask and detected person mask by `change_mask(camera, (H, W) uint8 from 0 to 255)`,
+    and the points detected in any camera by `change_points(camera, (frames, ..., 3))`. Images are JPEG, as written by
     ingest."""
     kept = dataclasses.replace(capture, root=out)
     write_arrays(capture, kept, change_points)

@@ -1,6 +1,6 @@
 """Degradations of masks: too small, too large, with holes, or without a limb.
 
-They raise NotApplicableError where no mask would differ, as where a share of a small image's width is less than a
+They raise NotApplicableError if no mask would change, for example if a share of a small image's width is less than a
 pixel: scores would only repeat those of the reference.
 """
 
@@ -15,20 +15,20 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.errors import NotApplicableError
 
 LIMBS = ((3, 4), (6, 7), (10, 11), (13, 14))  # BODY_25: elbow to wrist, knee to ankle; right, left
-BEYOND = 0.5  # of a limb's length: where the hand or foot ends
-THICKNESS = 0.8  # of what is cut, as a share of a limb's length
-HOLE_RADIUS = 0.1  # of the square root of a mask's area
+BEYOND = 0.5  # as a share of a limb's length: where the hand or foot ends
+THICKNESS = 0.8  # of the part that is cut, as a share of a limb's length
+HOLE_RADIUS = 0.1  # as a share of the square root of a mask's area
 
 MaskChange = Callable[[str, int, np.ndarray], np.ndarray]
 
 
 def erode(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
-    """Remove the mask's pixels within this percentage of the image's width of its edge."""
+    """Remove the pixels of the mask that are within this percentage of the image's width from its edge."""
     return _changed(masks, capture, lambda _, __, mask: _edge_distance_px(mask) > percent / 100 * mask.shape[1])
 
 
 def dilate(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
-    """Add the pixels within this percentage of the image's width of the person."""
+    """Add the pixels that are within this percentage of the image's width from the person."""
     return _changed(masks, capture, lambda _, __, mask: _edge_distance_px(~mask) <= percent / 100 * mask.shape[1])
 
 
@@ -40,7 +40,7 @@ def cut_holes(masks: Masks, capture: Capture, percent: float, rng: np.random.Gen
 def cut_limb(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
     """Remove a forearm with its hand, or a lower leg with its foot, from this percentage of the masks, at random.
 
-    Raises NotApplicableError if there are no keypoints, which tell where limbs are.
+    Raises NotApplicableError if there are no keypoints, which locate the limbs.
     """
     if not capture.has_keypoints:
         raise NotApplicableError(f"{capture.name}: has no keypoints, which locate the limbs")
@@ -67,7 +67,7 @@ def _changed(masks: Masks, capture: Capture, change: MaskChange) -> Masks:
 
 
 def _edge_distance_px(mask: np.ndarray) -> np.ndarray:
-    """Return the distance of each pixel of a mask to the nearest outside it, (H, W); 0 outside."""
+    """Return the distance of each pixel in a mask to the nearest one outside, (H, W); 0 outside."""
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
@@ -82,7 +82,7 @@ def _with_holes(mask: np.ndarray, share: float, rng: np.random.Generator) -> np.
 
 def _limb(person: np.ndarray, limb: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
     """Return the pixels around a limb's bone and beyond its end, (H, W) bool, from a person's keypoints (25, 3); none
-    if it was not detected."""
+    if the limb was not detected."""
     covered = np.zeros(shape, np.uint8)
     start, end = person[limb[0]], person[limb[1]]
     if start[2] > 0 and end[2] > 0:

@@ -11,17 +11,17 @@ from hnerf.errors import NotApplicableError
 from hnerf.geometry.camera import Camera
 from hnerf.study.degradations.images import rewrite_images
 
-DISTANCE_SHARE = 0.4  # of the distance from the person to the camera
+DISTANCE_SHARE = 0.4  # as a share of the distance from the person to the camera
 HALF_HEIGHT_M = 1.2  # taller than a person
 GREY = np.array([96, 96, 96], np.uint8)
 
 
 def add_pillar(capture: Capture, width_m: float, rng: np.random.Generator, out: Path) -> None:
-    """Put a grey square pillar between the person and a random training camera. It hides what lies behind it in every
-    training camera that it stands in front of the person for, in the clean plates as well; points and person masks
-    behind it are not detected.
+    """Put a grey square pillar between the person and a random training camera. It hides what is behind it, also in the
+    clean plates, in every training camera for which it stands in front of the person. Points and person masks behind it
+    are not detected.
 
-    Cameras that would see it behind or beside the person do not show it. Raises NotApplicableError if the person's
+    Cameras that would see it behind or next to the person do not show it. Raises NotApplicableError if the person's
     position is unknown.
     """
     person_m = person_middle(capture)
@@ -38,7 +38,7 @@ def add_pillar(capture: Capture, width_m: float, rng: np.random.Generator, out: 
 
 
 def person_middle(capture: Capture) -> np.ndarray:
-    """Return the point (3,) nearest to all rays through the middle of the person's keypoints, over all frames."""
+    """Return the point (3,) nearest to all rays through the mean of the person's keypoints over all frames."""
     if not capture.has_keypoints or len(capture.train_cameras) < 2:
         raise NotApplicableError(f"{capture.name}: the person's position is unknown; needs keypoints from two cameras")
     left, right = np.zeros((3, 3)), np.zeros(3)
@@ -63,7 +63,7 @@ def pillar(person_m: np.ndarray, camera: Camera, up: np.ndarray, width_m: float)
 
 
 def _hidden(camera: Camera, corners_m: np.ndarray, person_m: np.ndarray) -> np.ndarray:
-    """Return the pixels that the pillar covers, (H, W) bool; none unless it is wholly between the camera and the
+    """Return the pixels that the pillar covers, (H, W) bool; none unless all of it is between the camera and the
     person."""
     hidden = np.zeros((camera.height_px, camera.width_px), np.uint8)
     px, depth_m = camera.project(corners_m)
@@ -73,7 +73,7 @@ def _hidden(camera: Camera, corners_m: np.ndarray, person_m: np.ndarray) -> np.n
 
 
 def _without(points: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Return points (..., 3), set to zero on hidden pixels (H, W)."""
+    """Return points (..., 3), set to zero where they lie on hidden pixels (H, W)."""
     height_px, width_px = hidden.shape
     x, y = (points[..., k].round().astype(int).clip(0, size - 1) for k, size in enumerate((width_px, height_px)))
     return points * ~hidden[y, x][..., None]

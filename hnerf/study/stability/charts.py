@@ -18,14 +18,14 @@ SHADES = {"ok": "#e8f1ec", "degraded": "#f2c877", "refused": "#9dbbdc", "failed"
 LETTERS = {"ok": "o", "degraded": "D", "refused": "R", "failed": "F", "unscored": "?"}
 LABELS = {"psnr": "PSNR, dB", "chamfer_mm": "Chamfer distance, mm"}
 CAPTION = "line: mean over seeds; band: range; dotted: reference, same images or surfaces; cross: no score"
-COLUMNS = 4  # of panels, at most
+COLUMNS = 4  # of panels, maximum
 CELL, GAP = (0.52, 0.42), 0.4  # size of a matrix cell in inches; gap between methods in cells
 LEFT, BOTTOM, LEGEND = 2.7, 0.4, 6.2  # inches
 
 
 def matrix_chart(result: Row, path: Path) -> None:
-    """Draw a row for each degradation and a block of columns for each method: a letter and shade for each strength, the
-    mildest on the left, for the worst verdict over seeds."""
+    """Draw a row for each degradation and a block of columns for each method. Each strength, the mildest on the left,
+    gets a letter and a shade for the worst verdict over seeds."""
     methods, kinds = result["plan"]["methods"], result["plan"]["degradations"]
     wide = max(map(len, kinds.values()))
     across, down = len(methods) * (wide + GAP) - GAP, len(kinds) + 0.6  # in cells
@@ -51,8 +51,8 @@ def matrix_chart(result: Row, path: Path) -> None:
 
 def curve_chart(result: Row, key: str, path: Path) -> bool:
     """Draw a panel for each degradation: a score of every method over strength, starting from the capture as recorded.
-    Lines are means and bands ranges over seeds; the dotted line is the reference over the same images or surfaces; a
-    cross marks a seed without a score. Return whether there was a score to draw and the file was written."""
+    Lines are means and bands are ranges over seeds; the dotted line is the reference over the same images or surfaces;
+    a cross marks a seed without a score. Return whether there was a score to draw, so that the file was written."""
     measured = {run["kind"] for run in result["runs"] if run.get(key) is not None} - {REFERENCE}
     kinds = {kind: strengths for kind, strengths in result["plan"]["degradations"].items() if kind in measured}
     if not kinds:

@@ -16,8 +16,8 @@ FULL = "full"
 
 class StabilityStudy(Section):
     """A stability study: presets, seeds of degradations and training, settings overridden in all runs, and each
-    degradation's strengths, the mildest first. border_seeds: further seeds for degradations whose verdict is near a
-    border with the seeds before; part: the part of the capture that is used."""
+    degradation's strengths, the mildest first. border_seeds: further seeds for degradations whose verdict with the
+    other seeds is near a border; part: the part of the capture that is used."""
 
     methods: Annotated[tuple[str, ...], Field(min_length=1)]
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
@@ -27,8 +27,8 @@ class StabilityStudy(Section):
     degradations: Annotated[dict[str, tuple[float, ...]], Field(min_length=1)]
 
     def restricted_to(self, names: Collection[str]) -> "StabilityStudy":
-        """Return the study with these degradations only, with all if there are no names. Raises InputError for one that
-        it does not have."""
+        """Return the study with these degradations only, or with all if there are no names. Raises InputError if the
+        study does not have one of them."""
         for name in names:
             if name not in self.degradations:
                 raise InputError(f"--only {name}: not in this study; it has {', '.join(self.degradations)}")
@@ -36,7 +36,7 @@ class StabilityStudy(Section):
         return self.model_copy(update={"degradations": chosen})
 
     def left_out(self) -> list[str]:
-        """Return what the study omits compared with `configs/stability/full.yaml`, in lines for people."""
+        """Return what the study omits compared with `configs/stability/full.yaml`, as lines for people."""
         full = load_stability(FULL)
         lines = [f"`{name}` as a method" for name in full.methods if name not in self.methods]
         seeds = len(full.seeds) - len(self.seeds)
@@ -54,7 +54,7 @@ class StabilityStudy(Section):
 
 
 def load_stability(study: str) -> StabilityStudy:
-    """Load a study by its name under `configs/stability/` or its file's path. Raises InputError, one line, if it is
+    """Load a study by its name under `configs/stability/` or its file's path. Raises InputError, in one line, if it is
     invalid."""
     path = named_file(study, STUDIES, "study", "studies")
     found = validated(StabilityStudy, read_yaml(path), path)

@@ -1,6 +1,6 @@
 """Tables of a stability study, in Markdown.
 
-Runs are plain rows: method, seed, kind, strength, verdict, reason, and scores where there are any.
+Runs are plain rows: method, seed, kind, strength, verdict, reason, and scores if there are any.
 """
 
 import itertools
@@ -52,8 +52,8 @@ Row = dict[str, Any]
 
 
 def worst_run(result: Row, method: str, kind: str, strength: float) -> Row | None:
-    """Return the worst run over seeds, None if there is none yet. If every reference run of the method is broken, the
-    reference runs count as well."""
+    """Return the worst run over seeds, or None if there is none yet. If every reference run of the method is broken,
+    the reference runs count as well."""
     found = [r for r in result["runs"] if r["method"] == method and r["kind"] == kind and r["strength"] == strength]
     good = [r for r in result["runs"] if r["method"] == method and r["kind"] == REFERENCE]
     if all(r["verdict"] in BROKEN for r in good):
@@ -62,8 +62,8 @@ def worst_run(result: Row, method: str, kind: str, strength: float) -> Row | Non
 
 
 def tolerated_strength(result: Row, method: str, kind: str) -> str:
-    """Return the strongest strength up to which the worst seed of each is ok, the first at which one is degraded, and
-    the first at which one fails or is refused, if there are such."""
+    """Return the strongest strength up to which the worst seed is ok at every strength, the first strength at which a
+    seed is degraded, and the first at which one fails or is refused, as far as there are any."""
     strengths = result["plan"]["degradations"][kind]
     runs = [(f"{s:g}", run["verdict"]) for s in strengths if (run := worst_run(result, method, kind, s))]
     held = [strength for strength, _ in itertools.takewhile(lambda run: run[1] == "ok", runs)]
@@ -74,8 +74,8 @@ def tolerated_strength(result: Row, method: str, kind: str) -> str:
 
 
 def as_markdown(result: Row, charts: Sequence[str]) -> str:
-    """Format the whole result: how far each method holds, charts, every run, what was left out, and what verdicts
-    mean."""
+    """Format the whole result: how far each method holds, charts, every run, what was left out, and the meaning of
+    verdicts."""
     methods, kinds = result["plan"]["methods"], result["plan"]["degradations"]
     lines = [f"# Stability of {', '.join(methods)} on {result['subject']}: study `{result['study']}`", "", LEGEND, ""]
     lines += ["## How far each method holds", "", *head(["degradation", *methods])]

@@ -1,4 +1,4 @@
-"""Verdict on a run under a degradation, compared with the same run on the capture as recorded."""
+"""Verdict on a run under a degradation, by comparison with the same run on the capture as recorded."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -9,7 +9,7 @@ BROKEN: tuple[Verdict, ...] = ("refused", "failed")
 
 # 1 dB is a quarter more squared error, visible only side by side; 6 dB is four times as much.
 DEGRADED_DB, FAILED_DB = 1.0, 6.0
-FAILED_SHARE = 0.5  # of the PSNR of a good run above an empty picture, if that is less than 6 dB
+FAILED_SHARE = 0.5  # of a good run's PSNR above that of an empty image, if that is less than 6 dB
 # Likewise a quarter more distance; at three times a good run's distance, parts of the body are in the wrong place.
 DEGRADED_RATIO, FAILED_RATIO = 1.25, 3.0
 BORDER_SHARE = 0.2  # share of the allowed loss around a border within which another seed could change the verdict
@@ -17,7 +17,7 @@ BORDER_SHARE = 0.2  # share of the allowed loss around a border within which ano
 
 @dataclass(frozen=True)
 class RunVerdict:
-    """A verdict. reason: one line, empty if it is ok."""
+    """A verdict. reason: one line, empty if the verdict is ok."""
 
     verdict: Verdict
     reason: str = ""
@@ -29,9 +29,9 @@ def judge(
     """Judge a degraded run by its scores and those of its reference.
 
     `scores` and `reference` hold psnr (dB) and chamfer_mm of the same images and surfaces, degraded and not, or None
-    where there is no truth; `reference` also holds empty_psnr, of an empty picture. `scores` is None if only surfaces
-    are judged. faults: what is wrong with surfaces, which is failure whatever the scores. leniency: factor on the
-    losses, in dB and in distance, that are allowed.
+    where there is no ground truth; `reference` also holds empty_psnr, that of an empty image. `scores` is None if only
+    surfaces are judged. faults: what is wrong with surfaces; any fault is a failure, whatever the scores. leniency:
+    factor on the allowed losses, in dB and in distance.
     """
     if faults:
         return RunVerdict("failed", faults[0])
@@ -57,11 +57,11 @@ def judge(
 
 
 def near_border(scores: dict[str, Any] | None, reference: dict[str, Any], faults: list[str]) -> bool:
-    """Return whether the verdict would differ if the allowed losses were a fifth smaller or larger."""
+    """Return whether the verdict would change if the allowed losses were a fifth smaller or larger."""
     strict, lenient = (judge(scores, reference, faults, leniency) for leniency in (1 - BORDER_SHARE, 1 + BORDER_SHARE))
     return strict.verdict != lenient.verdict
 
 
 def _classify(value: float, degraded: float, failed: float) -> Verdict:
-    """Classify a loss; NaN is a failure, and so is a value over `failed` even if it is below `degraded`."""
+    """Classify a loss. NaN is a failure, and so is a value above `failed`, even if it is below `degraded`."""
     return "failed" if not value <= failed else "degraded" if value > degraded else "ok"
