@@ -1,4 +1,4 @@
-"""torchrun, with a report of the first failed rank in a file: python -m tasks.agent FILE TORCHRUN'S ARGUMENTS."""
+"""torchrun that also reports the first failed rank in a file: python -m tasks.agent FILE TORCHRUN'S ARGUMENTS."""
 
 import json
 import os
@@ -14,8 +14,8 @@ from tasks.rank import AGENT
 
 
 def main(failure: Path, arguments: list[str]) -> None:
-    """Run torchrun, and end this process at once when it is done: where it was interrupted while it ended its ranks,
-    threads of it go on, and the interpreter would wait for them."""
+    """Run torchrun, then end this process at once. If torchrun was interrupted while it ended its ranks, some of its
+    threads continue, and the interpreter would wait for them."""
     code = 1
     os.environ[AGENT] = str(os.getpid())
     try:

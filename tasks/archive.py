@@ -15,8 +15,8 @@ from tasks.store import OPTIONAL, STAGES, Artifact, Store
 
 
 class Manifest(Contents):
-    """What a subject's archive holds. recording: the lines of the subject's `.recording`; latest: artifact of each
-    stage."""
+    """The contents of a subject's archive. recording: the lines of the subject's `.recording`; latest: the artifact of
+    each stage."""
 
     subject: Annotated[str, Field(pattern=r"^[^/]{1,200}$")]
     recording: Annotated[str, Field(pattern=r"^([0-9a-f]{64}\n[^\n]*\n)?$")]
@@ -33,8 +33,8 @@ class Manifest(Contents):
 
 
 def export_subject(store: Store, subject: str, out: Path) -> Manifest:
-    """Write a subject's latest artifacts, with all that they were computed from, into a new file. Raises InputError if
-    there is no such subject, an artifact is damaged, or `out` exists."""
+    """Write a subject's latest artifacts, with all artifacts that they were computed from, into a new file. Raises
+    InputError if there is no such subject, an artifact is damaged, or `out` exists."""
     if out.exists():
         raise InputError(f"{out}: exists; give the name of a new file")
     inventory = Inventory.of(store)
@@ -50,10 +50,10 @@ def export_subject(store: Store, subject: str, out: Path) -> Manifest:
 
 
 def import_subject(store: Store, path: Path) -> Manifest:
-    """Put an archive's artifacts into the store, each as if it had been computed there, and link the subject to them.
+    """Put an archive's artifacts into the store, as if they had been computed there, and link the subject to them.
 
-    What the store has already stays. Raises InputError, and links nothing, if the file is no such archive, is damaged,
-    would fill the disk, or if the subject's name belongs to another recording here.
+    Artifacts that the store already has stay. Raises InputError, and links nothing, if the file is not such an archive,
+    is damaged or would fill the disk, or if the subject's name belongs to another recording in this store.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give an archive of `hnerf store export`")

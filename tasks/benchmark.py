@@ -1,4 +1,4 @@
-"""The scoring stages of a benchmark: scores of a training's snapshots and of its end, and rendering times."""
+"""The scoring stages of a benchmark: scores of a training's snapshots and its final model, and rendering times."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def score_training(
     training: Artifact,
     settings: ScoringSettings,
 ) -> dict[str, float]:
-    """Score a training's snapshots and its end on held-out data, and time the rendering of a frame."""
+    """Score a training's snapshots and its final model on held-out data, and time the rendering of a frame."""
     found = score(scoring_scene(truth, recording, calibration, body), training.root, settings, out)
     require_unchanged(truth)
     psnr = found[found["split"]]["psnr"]

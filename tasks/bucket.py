@@ -1,4 +1,4 @@
-"""A place that many machines share: a folder of any file system that fsspec knows, such as a bucket of S3.
+"""A place that many machines share: a folder on any file system that fsspec supports, such as an S3 bucket.
 
 Objects must appear whole or not at all, as in object stores; on a local or mounted disk they are renamed into place.
 """
@@ -33,20 +33,21 @@ class RemoteFile:
 
 
 class BucketError(ConnectionError):
-    """The bucket did not answer as it should; a later try may succeed. The message, one line, says why."""
+    """The bucket did not respond as expected; a later try may succeed. The message, one line, says why."""
 
 
 @dataclass(frozen=True)
 class Bucket:
-    """A folder of a file system. Names are relative to it. Raises BucketError where the file system fails, InputError
-    where it does not let this user in, FileNotFoundError for what is not there."""
+    """A folder of a file system. Names are relative to it. Raises BucketError if the file system fails, InputError if
+    it denies access to this user, and FileNotFoundError if something does not exist."""
 
     fs: AbstractFileSystem
     root: str
 
     @staticmethod
     def configured() -> "Bucket | None":
-        """Return the bucket that the environment names, None if it names none. Raises InputError if it is not there."""
+        """Return the bucket that the environment names, None if it names none. Raises InputError if that bucket does
+        not exist."""
         url = os.environ.get(VARIABLE, "")
         try:
             return Bucket.at(url) if url else None
@@ -55,8 +56,8 @@ class Bucket:
 
     @staticmethod
     def at(url: str) -> "Bucket":
-        """Return the bucket of a URL like s3://bucket/folder or file:///mnt/share. Raises InputError where it is not
-        there, or nothing opens it."""
+        """Return the bucket of a URL like s3://bucket/folder or file:///mnt/share. Raises InputError if it does not
+        exist or no installed library can open it."""
         try:
             if urlsplit(url).password or "::" in url:
                 raise InputError("a URL with a password or `::` is refused; give keys by the environment")
@@ -64,14 +65,14 @@ class Bucket:
                 raise InputError(
                     f"{url}: is no bucket; download it and give the file, or a URL like s3://bucket/folder"
                 )
-            # Others write here, too: no listing may be remembered.
+            # Others write here, too, so listings must not be cached.
             fs, root = url_to_fs(url, use_listings_cache=False)
         except ImportError:
             raise InputError(f"what opens {url} is not installed; for S3, install '.[s3]'") from None
-        except (TypeError, ValueError) as error:  # TypeError: a kind of place that needs more than a URL
+        except (TypeError, ValueError) as error:  # TypeError: a file system that needs more than a URL
             raise InputError(f"{url}: {one_line(error)}; give a URL like s3://bucket/folder") from None
         bucket = Bucket(fs, root.rstrip("/"))
-        # What begins with a bucket's name is an object store, where folders need not exist.
+        # A path that begins with a bucket's name is in an object store, where folders need not exist.
         top = bucket.root if bucket.root.startswith("/") else bucket.root.split("/")[0]
         with bucket._answering(""):
             try:
@@ -96,7 +97,8 @@ class Bucket:
         return None
 
     def folders(self) -> list[str]:
-        """Return the names of the folders at the top, sorted, without hidden ones; none before the first file."""
+        """Return the names of the top-level folders, sorted, without hidden ones; none if nothing has been written
+        yet."""
         with self._answering(""):
             try:
                 entries = self.fs.ls(self.root, detail=True)
@@ -106,8 +108,8 @@ class Bucket:
         return sorted(name for name in names if is_visible(name))
 
     def files(self, folder: str) -> Iterator[RemoteFile]:
-        """Yield the files below a folder of an object store, sorted, without hidden ones and markers of folders; none
-        where there is no such folder. Raises InputError where the file system knows no ETags."""
+        """Yield the files below a folder of an object store, sorted, without hidden ones and folder markers; none if
+        there is no such folder. Raises InputError if the file system does not provide ETags."""
         root = self._path(folder).rstrip("/")
         with self._answering(folder):
             found = self.fs.find(root, detail=True)
@@ -125,7 +127,7 @@ class Bucket:
             self.fs.get_file(self._path(name), str(path), callback=progress)
 
     def upload(self, path: Path, name: str) -> None:
-        """Make or replace an object with a file's bytes."""
+        """Create or replace an object with a file's bytes."""
         with self._answering(name, written=True):
             if not self.is_disk:
                 self.fs.put_file(str(path), self._path(name))
@@ -135,7 +137,7 @@ class Bucket:
                 self.fs.put_file(str(path), str(beside))
 
     def create_note(self, name: str, text: bytes) -> bool:
-        """Make a small object; return False if it is there already, which the file system decides for all machines."""
+        """Create a small object. Return False if it already exists, which the file system decides for all machines."""
         with self._answering(name, written=True):
             self._make_folder(name)
             try:
@@ -146,13 +148,13 @@ class Bucket:
             return True
 
     def write_note(self, name: str, text: bytes) -> None:
-        """Make or replace a small object."""
+        """Create or replace a small object."""
         with self._answering(name, written=True):
             self.fs.pipe_file(self._path(name), text)
 
     def read_note(self, name: str) -> bytes | None:
         """Return the beginning of a small object, None if there is no such object."""
-        with self._answering(name), suppress(FileNotFoundError):  # in one request: it may be rewritten meanwhile
+        with self._answering(name), suppress(FileNotFoundError):  # in one request, since it may be rewritten meanwhile
             return bytes(self.fs.cat_file(self._path(name), end=MAX_NOTE_BYTES))
         return None
 
@@ -170,8 +172,8 @@ class Bucket:
 
     @contextmanager
     def _answering(self, name: str, written: bool = False) -> Iterator[None]:
-        """Turn what goes wrong inside into errors of one line; file systems raise those of many libraries. written:
-        what is not there is the bucket itself, not the object."""
+        """Turn errors raised inside into ones with a one-line message; file systems raise the errors of many libraries.
+        written: if something is missing, it is the bucket itself, not the object."""
         try:
             yield
         except InputError:
@@ -189,5 +191,5 @@ class Bucket:
 
 
 def is_visible(name: str) -> bool:
-    """Return whether neither a file nor a folder around it is hidden."""
+    """Return whether neither a file nor any folder that contains it is hidden."""
     return all(part and not part.startswith(".") for part in name.split("/"))

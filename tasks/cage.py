@@ -1,7 +1,7 @@
-"""A process of its own, with limits, in which strangers' files are read.
+"""A separate process, with limits, that reads untrusted files.
 
-A reader that crashes, or that wants all memory, all processors or the network, ends this process and not the run. It
-gets its work pickled from the run; what comes back is text, a JSON object a line:
+A reader that crashes, or that takes all memory, all processors or the network, ends this process and not the run. The
+run sends it its work pickled; it answers in text, one JSON object per line:
 
     {"log": [logger, level, message]}, {"progress": [what, done, total]}, {"opened": path}, {"printed": text}
     {"error": "InputError" | "OSError" | "other", "arguments": [...]}, at most one
@@ -30,7 +30,7 @@ from hnerf.progress import Progress, listening, report
 from tasks.launcher import KILLED, LostWorkerError
 from tasks.limits import current_limits, limit_s
 
-MAX_WRITTEN_BYTES = 1 << 32  # a file: one picture, or the keypoints of a camera
+MAX_WRITTEN_BYTES = 1 << 32  # per file: one image, or the keypoints of a camera
 MAX_OPEN_FILES = 1024
 CLONE_NEWUSER, CLONE_NEWNET = 0x10000000, 0x40000000  # linux/sched.h
 BEYOND = {errno.EFBIG: "what is written of it is too large", errno.EMFILE: "it needs too many open files"}
@@ -38,13 +38,13 @@ NO_MEMORY = -4  # cv2.Error.StsNoMem
 
 
 def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> None:
-    """Call `read(*arguments)`, which reads files of `folder`, in a process of its own; log what it logs, print what it
-    prints.
+    """Call `read(*arguments)`, which reads files in `folder`, in a separate process. Log and print here what it logs
+    and prints.
 
-    Memory, processor time without progress, size and number of files are limited, and there is no network where the
-    system lets a process give it up. Raises InputError that names the file where a limit ends it or it crashes,
-    LostWorkerError where it was killed from outside, and what it raises itself: InputError and OSError as they are,
-    others as RuntimeError.
+    Memory, processor time without progress, and size and number of files are limited. There is no network if the system
+    lets a process give it up. Raises InputError that names the file if a limit ends the process or it crashes,
+    LostWorkerError if it was killed from outside, and the errors of `read`: InputError and OSError unchanged, others as
+    RuntimeError.
     """
     size = int(current_limits().reader_gib * (1 << 30))
     work = pickle.dumps((read, arguments, str(folder), size, limit_s(1)))
@@ -102,11 +102,11 @@ def _killed(opened: Path, by: signal.Signals) -> Exception:
 
 
 def _main(parent: int) -> None:
-    """Do the work that comes on standard input."""
+    """Do the work that arrives on standard input."""
     end_with_parent(signal.SIGKILL, parent)
     _give_up_network()
     replies = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # what libraries print
+    os.dup2(2, 1)  # for what libraries print
     read, arguments, folder, memory_bytes, patience_s = pickle.load(sys.stdin.buffer)
     opened = Path(folder)
 
@@ -135,7 +135,7 @@ def _main(parent: int) -> None:
 
 
 def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object]:
-    """Return what the run is told of an error; one of a limit names the file that was opened last."""
+    """Return the message to the run about an error. If a limit was exceeded, it names the file that was opened last."""
     number = error.errno if isinstance(error, OSError) else None
     if isinstance(error, MemoryError) or getattr(error, "code", None) == NO_MEMORY:
         why = f"reading it needs more than {memory_bytes / (1 << 30):g} GiB"
@@ -175,7 +175,7 @@ class _Sender(logging.Handler):
 
 
 def _give_up_network() -> None:
-    """Have no network from here on, where the system lets a process without rights or as root say so."""
+    """Give up the network for good, if the system allows that to a process, be it without rights or as root."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "unshare") and libc.unshare(CLONE_NEWNET):
         libc.unshare(CLONE_NEWUSER | CLONE_NEWNET)
@@ -187,13 +187,13 @@ def _limit(what: int, most: int) -> None:
 
 
 def _allowed(what: int, most: int) -> int:
-    """Return the limit, or the lower one that the system already sets."""
+    """Return the limit, or a lower one that the system already sets."""
     _, allowed = resource.getrlimit(what)
     return most if allowed == resource.RLIM_INFINITY else min(most, allowed)
 
 
 def _limit_processor_time(seconds: float) -> None:
-    """Let this process use that much of a processor's time from now on."""
+    """Allow this process that much more processor time, counted from now."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     _, allowed = resource.getrlimit(resource.RLIMIT_CPU)
     most = int(used.ru_utime + used.ru_stime + seconds) + 1

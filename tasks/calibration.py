@@ -12,7 +12,7 @@ from tasks.store import Artifact
 
 @stage("calibration", version="21")
 def calibrate(out: Path, recording: Artifact, settings: CalibrationSettings) -> dict[str, float]:
-    """Check the cameras against the images, and write those to be used from here on."""
+    """Check the cameras against the images, and write the cameras to be used by later stages."""
     report = check_calibration(Capture.load(recording.root), settings)
     report.save(out)
     medians_px = [verdict.median_px for verdict in report.verdicts.values() if verdict.median_px is not None]

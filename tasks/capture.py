@@ -1,4 +1,4 @@
-"""The capture stage: a recording in one common layout."""
+"""The capture stage: the recording in one common layout."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def subset_capture(
     train_frames: tuple[int, ...] | None,
     novel_pose_frames: tuple[int, ...] | None,
 ) -> dict[str, float]:
-    """Write a capture with only these training cameras and frames; None keeps all. Test cameras stay."""
+    """Write a capture with only these training cameras and frames; None keeps all. All test cameras are kept."""
     subset(Capture.load(recording.root), out, cameras, train_frames, novel_pose_frames)
     kept = Capture.load(out)
     return {"cameras": len(kept.cameras), "frames": len(kept.frames)}

@@ -1,4 +1,4 @@
-"""The stages that look for people and for their hands by networks."""
+"""The stages that detect people and their hands with networks."""
 
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -16,7 +16,7 @@ from tasks.store import Artifact
 @stage("detection", version="5", resumable=True)
 def detect(out: Path, recording: Artifact, source: str | None, size: str) -> dict[str, float]:
     """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
-    finished. source, size: of DetectionSettings, whose other fields would not change the result."""
+    finished. source, size: of DetectionSettings, whose other fields do not change the result."""
     settings = DetectionSettings.model_validate({"source": source, "size": size})
     try:
         report = detect_people(Capture.load(recording.root), settings, out)
@@ -26,8 +26,8 @@ def detect(out: Path, recording: Artifact, source: str | None, size: str) -> dic
 
 
 def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
-    """Return whether to run the network: the settings request it, or the recording has neither keypoints nor given
-    poses, or a single camera, for which the network, if it is installed, sees the depth of limbs."""
+    """Return whether to run the network. It runs if the settings request it, or the recording has neither keypoints nor
+    given poses. It also runs for a single camera, if it is installed, since it estimates the depth of limbs."""
     capture = Capture.load(recording.root)
     posed = capture.given_poses() is not None
     flat = len(capture.train_cameras) == 1 and not posed and has_model(POSE_DETECTOR)
@@ -37,13 +37,13 @@ def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
 
 @stage("hands", version="1")
 def find_hands(out: Path, recording: Artifact) -> dict[str, float]:
-    """Write the recording with the points of hands. Return the least share of hands found in a camera."""
+    """Write the recording with keypoints of hands. Return the lowest share of hands found in any camera."""
     return {"least_found": min(detect_hands(Capture.load(recording.root), out).values())}
 
 
 def needs_hands(recording: Artifact, settings: DetectionSettings) -> bool:
-    """Return whether to look for hands: the settings allow it, the network is installed, keypoints say where, and
-    several cameras see them, as a fit of fingers needs."""
+    """Return whether to detect hands: the settings allow it, the network is installed, there are keypoints that locate
+    the hands, and there are several cameras, which a fit of fingers needs."""
     if settings.hands != "auto" or not has_model(HAND_LANDMARKS):
         return False
     capture = Capture.load(recording.root)

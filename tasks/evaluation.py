@@ -31,8 +31,8 @@ def evaluate(
     settings: EvaluationSettings,
     held_out: tuple[Artifact, ...] = (),
 ) -> dict[str, float]:
-    """Write renderings, meshes and scores by the evaluation protocol of docs/method.md, and a report. held_out:
-    artifacts of `evaluate_held_out`, one a camera."""
+    """Write renderings, meshes and scores according to the evaluation protocol of docs/method.md, and a report.
+    held_out: artifacts of `evaluate_held_out`, one per camera."""
     inputs = EvaluationInputs(
         capture_folder=truth.root,
         capture=calibrated_capture(recording, calibration),

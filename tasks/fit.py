@@ -16,7 +16,7 @@ def fit(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact | None, settings: FitSettings
 ) -> dict[str, float]:
     """Fit one body shape and one pose per frame to keypoints, and to contours if there are masks. Return the seconds of
-    each part; no file holds them, so that the same body made again is the same artifact."""
+    each part; no file holds them, so that fitting the same body again gives the same artifact."""
     masks = Masks.load(segmentation.root) if segmentation else None
     body, report = fit_body(calibrated_capture(recording, calibration), masks, settings)
     seconds = report.pop("seconds")

@@ -1,9 +1,9 @@
-"""What a store holds that nobody needs, and its removal beside running flows.
+"""Artifacts and leftovers in a store that nobody needs, and their removal while flows are running.
 
 An artifact is needed if a subject's latest results link to it or were computed from it, or if a running process uses
-it. A use is noted twice: in the process's own file (tasks/pins.py), and as the record's time of change. Removal takes a
-record away first, and puts it back if its time has changed since it was read: either a process finds no record, or its
-use is seen here.
+it. A use is recorded twice: in the process's own file (tasks/pins.py), and as the modification time of the artifact's
+record. Removal first moves the record aside, and puts it back if its time has changed since it was read. So either the
+process finds no record, or its use is noticed here.
 """
 
 import fcntl
@@ -23,8 +23,8 @@ LEFT = re.compile(rf"({KEY.pattern})(\.partial|\.json\.partial|\.moving|\.shared
 
 @dataclass(frozen=True)
 class Garbage:
-    """Something to remove: the artifact of a key, or what is `left` of work on it that was interrupted, or of one that
-    cannot be found any more. used_s: when it was last used or written, in seconds since 1970."""
+    """Something to remove: the artifact of a key or, if `left` has paths, the remains of interrupted work on it or of
+    an artifact that cannot be found any more. used_s: when it was last used or written, in seconds since 1970."""
 
     stage: str
     key: str
@@ -34,13 +34,13 @@ class Garbage:
 
     @property
     def what(self) -> str:
-        """Return a word for it."""
+        """Return a word for what it is."""
         return "leftover" if self.left else "artifact"
 
 
 def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbage]:
-    """Return what the `keep` newest results of no subject need, what was left by work that was interrupted, and what
-    cannot be found any more, as far as nobody has used it for `older_s` seconds or works on it now."""
+    """Return the artifacts that the `keep` newest results of no subject need, the remains of interrupted work, and what
+    cannot be found any more. Leave out what was used in the last `older_s` seconds, or is being worked on."""
     needed = inventory.needed(keep)
     found = [
         Garbage(one.artifact.stage, one.artifact.root.name, (), one.size_bytes, one.used_s)
@@ -53,7 +53,8 @@ def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbag
 
 
 def collect(store: Store, garbage: Garbage) -> bool:
-    """Remove it; return False, with all in place, if a process works on the key or has used it meanwhile."""
+    """Remove it. Return False, and leave everything in place, if a process works on the key or has used it
+    meanwhile."""
     try:
         with store.locked(garbage.stage, garbage.key, wait=False):
             return _remove_left(store, garbage) if garbage.left else _remove_artifact(store, garbage)
@@ -78,21 +79,21 @@ def _remove_artifact(store: Store, garbage: Garbage) -> bool:
 def _remove_left(store: Store, garbage: Garbage) -> bool:
     own = {store.path(garbage.stage, garbage.key, end) for end in ("", ".json")}
     finished = not own.isdisjoint(garbage.left) and _can_be_found(store, garbage)  # it was about to be recorded
-    if finished or _written_s(garbage.left) > garbage.used_s:  # resumed, and interrupted again
+    if finished or _written_s(garbage.left) > garbage.used_s:  # it was resumed, and interrupted again
         return False
     for path in garbage.left:
         if path.is_dir() and not path.is_symlink():
             remove(path)
-        elif path.suffix != ".lock":  # that one is held, and goes last (Store.locked)
+        elif path.suffix != ".lock":  # the lock is held, and removed last (Store.locked)
             path.unlink(missing_ok=True)
     return True
 
 
 def _is_locked(lock: Path) -> bool:
-    """Return whether a process holds a lock, as whoever works on its key does; the lock is left as it is."""
+    """Return whether a process holds a lock, as one that works on the key does. The lock is left unchanged."""
     if lock.is_symlink() or not lock.is_file():
         return False
-    with suppress(OSError), lock.open() as file:  # removed meanwhile, or not to be read
+    with suppress(OSError), lock.open() as file:  # removed meanwhile, or not readable
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -109,8 +110,8 @@ def _can_be_found(store: Store, garbage: Garbage) -> bool:
 
 
 def _left_behind(inventory: Inventory) -> Iterator[Garbage]:
-    """Yield, by key, folders without a record, work in progress, the locks of keys that have nothing else, and records
-    that cannot be read or have no folder, with what is there, unless it is in use."""
+    """Yield, by key, leftovers that are not in use: folders without a record, work in progress, locks of keys that have
+    nothing else, and records that cannot be read or have no folder."""
     used = inventory.used
     lost = {record for record in inventory.unreadable if f"{record.parent.name}/{record.stem}" not in used}
     left: dict[tuple[str, str], list[Path]] = {}
@@ -129,7 +130,7 @@ def _left_behind(inventory: Inventory) -> Iterator[Garbage]:
 
 
 def _written_s(paths: tuple[Path, ...]) -> float:
-    """Return when any of these files, or a file below these folders, was last written; 0 if none is left."""
+    """Return when any of these files, or a file in these folders, was last written; 0 if none is left."""
     times = [0.0]
     for path in [file for one in paths if one.suffix != ".lock" for file in [one, *one.rglob("*")]]:
         with suppress(FileNotFoundError):

@@ -1,4 +1,4 @@
-"""What is in a store: its artifacts, whose they are, and what they were computed from."""
+"""The contents of a store: its artifacts, the subjects they belong to, and what they were computed from."""
 
 import os
 import re
@@ -20,7 +20,7 @@ NOBODY = "-"
 
 @dataclass(frozen=True)
 class Stored:
-    """An artifact, and when it was made and last used (seconds since 1970)."""
+    """An artifact, and when it was made and last used, in seconds since 1970."""
 
     artifact: Artifact
     made_s: float
@@ -34,7 +34,7 @@ class Stored:
 
 @dataclass(frozen=True)
 class Inventory:
-    """The artifacts of a store by name (`<stage>/<key>`), the latest ones of each subject by stage, and the records
+    """The artifacts of a store by name (`<stage>/<key>`), each subject's latest artifacts by stage, and the records
     that cannot be read or have no folder."""
 
     store: Store
@@ -44,7 +44,7 @@ class Inventory:
 
     @staticmethod
     def of(store: Store) -> "Inventory":
-        """Read the records and links of a store, beside which flows may run."""
+        """Read the records and links of a store; flows may run meanwhile."""
         stored, unreadable = {}, []
         for record in in_stages(store, "*.json"):
             if not KEY.fullmatch(record.stem) or not record.is_file():
@@ -61,7 +61,8 @@ class Inventory:
         return Inventory(store, stored, _latest(store), tuple(unreadable))
 
     def with_inputs(self, names: Iterable[str]) -> set[str]:
-        """Return these artifacts and all that they were computed from, as far as it is there and records say so."""
+        """Return these artifacts and all that they were computed from, as far as these exist and the records name
+        them."""
         found: set[str] = set()
         waiting = list(names)
         while waiting:
@@ -73,7 +74,8 @@ class Inventory:
 
     @cached_property
     def owners(self) -> dict[str, set[str]]:
-        """Return the subjects of each artifact: those whose recordings it was computed from, or who link to it."""
+        """Return the subjects of each artifact: those that link to it or to something computed from it, or else those
+        whose recordings it was computed from."""
         owners: dict[str, set[str]] = {name: set() for name in self.stored}
         for subject, links in self.latest.items():
             for name in self.with_inputs(links.values()):
@@ -90,17 +92,18 @@ class Inventory:
 
     @property
     def used(self) -> set[str]:
-        """Return the names of what subjects link to and running processes use, be it there or not."""
+        """Return the names of the artifacts that subjects link to or running processes use, whether they exist or
+        not."""
         return pinned(self.store.root).union(*(links.values() for links in self.latest.values()))
 
     def needed(self, keep: int = 1) -> set[str]:
-        """Return the artifacts that the `keep` newest results of every subject need, its links, and what running
-        processes use."""
+        """Return the artifacts that are needed by the `keep` newest results of every subject, by its links, and by
+        running processes."""
         roots = self.used
         for subject, links in self.latest.items():
-            ended_early = "asset" not in links  # a run that replaced the links of a finished one
+            ended_early = "asset" not in links  # an unfinished run replaced the links of a finished one
             newest = [one.artifact for one in self.of_subject(subject)[::-1]] if keep > 1 or ended_early else []
-            assets = [one for one in newest if one.stage == "asset"][:keep]  # with which runs end, and nothing else
+            assets = [one for one in newest if one.stage == "asset"][:keep]  # only complete runs end with one
             trained = {name for one in assets for name in one.inputs if name.startswith("training/")}
             scores = [one for one in newest if one.stage == "evaluation" and trained & set(one.inputs)]
             roots |= {one.name for one in assets + scores}
@@ -108,19 +111,19 @@ class Inventory:
 
 
 def in_stages(store: Store, pattern: str) -> Iterator[Path]:
-    """Yield what lies in the folders of stages, and nowhere else in the store."""
+    """Yield the files and folders in the folders of stages, and nothing else in the store."""
     for folder in sorted(store.root.iterdir()):
         if STAGE.fullmatch(folder.name) and folder.name not in NO_STAGES:
             yield from sorted(folder.glob(pattern))
 
 
 def recording_of(store: Store, subject: str) -> str:
-    """Return the folder of the recording that a subject's results are of, empty if it is not known."""
+    """Return the folder of the recording from which a subject's results were computed; empty if it is not known."""
     return " ".join(store.recording(subject).splitlines()[1:])
 
 
 def _latest(store: Store) -> dict[str, dict[str, str]]:
-    """Return the names of the artifacts that the links of each subject point to."""
+    """Return the names of the artifacts to which each subject's links point."""
     folders = sorted(path for path in (store.root / "subjects").glob("*") if path.is_dir())
     return {folder.name: dict(_links(folder)) for folder in folders}
 
@@ -133,7 +136,7 @@ def _links(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def _recorded_name(artifact: Artifact) -> str:
-    """Return the name of the person in a recording, empty for the artifacts of other stages."""
+    """Return the name of the person in a recording; empty for artifacts of other stages."""
     if artifact.stage != STAGES[0]:
         return ""
     described = artifact.root / "capture.json"

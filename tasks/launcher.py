@@ -1,4 +1,4 @@
-"""Launcher of a module in several processes under torchrun, none of which outlives the caller."""
+"""Launcher that runs a module in several processes under torchrun, none of which outlives the caller."""
 
 import errno
 import fcntl
@@ -22,11 +22,11 @@ from hnerf.processes import end_with_parent
 from hnerf.progress import report_relayed
 
 GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
-LAST_LINES = 20  # of a failed rank, in the error
+LAST_LINES = 20  # of a failed rank's output, shown in the error
 RANK_LINE = re.compile(r"^\[default\d+\]:")
 LOGS, LOCK, YOUNG_S = "hnerf-ranks-", "lock", 60.0
 FAILURE = "failure.json"  # tasks/agent.py: the first failing rank and its exit code
-# Sent from outside; other signals are raised by the process itself and would recur.
+# Signals sent from outside; others are raised by the process itself and would recur.
 KILLED = (signal.SIGKILL, signal.SIGTERM)
 
 
@@ -35,25 +35,25 @@ class LostWorkerError(RuntimeError):
 
 
 class RankFailedError(RuntimeError):
-    """A rank could not go on because of its work; the message, one line, says why. It is not retried."""
+    """A rank could not continue because of its work; the message, one line, says why. It is not retried."""
 
 
 def _os_error(message: str) -> OSError:
-    """Build an OSError from JSON: errno, its meaning, file; errno is null if a library did not report one."""
+    """Build an OSError from JSON: errno, its meaning, file. errno is null if a library did not report one."""
     number, why, name = json.loads(message)
     return OSError(why) if number is None else OSError(number, why, name)
 
 
-# Exceptions for exit codes of ranks that say the reason in a line on stderr; libraries may say more at exit.
+# Exceptions by exit code of ranks that print the reason in one line on stderr; libraries may print more at exit.
 ERROR_BY_EXIT_CODE: dict[int, Callable[[str], Exception]] = {2: InputError, 3: RankFailedError, 4: _os_error}
 
 
 def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
-    """Run `python -m module arguments` in `processes` processes, and log their lines as they come.
+    """Run `python -m module arguments` in `processes` processes, and log their output line by line.
 
     Raises the exception of ERROR_BY_EXIT_CODE if a rank ends with that code, LostWorkerError if one was killed, and
-    otherwise RuntimeError with the last lines of the first failing rank. All ranks end when the caller does, however it
-    ends: the kernel signals the caller's death to torchrun, and torchrun's to the ranks.
+    otherwise RuntimeError with the last lines of the first failing rank. All ranks end with the caller, however it
+    ends: the kernel signals the caller's death to torchrun, and torchrun's death to the ranks.
     """
     _remove_left_behind()
     with TemporaryDirectory(prefix=LOGS) as logs, Path(logs, LOCK).open("w") as lock:
@@ -81,8 +81,8 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
 
 
 def _remove_left_behind() -> None:
-    """Remove the folders of logs whose process was killed. One is in use while its lock is held; a young one may not
-    have been locked yet."""
+    """Remove log folders whose process was killed. A folder is in use while its lock is held; a recent one may not be
+    locked yet."""
     for folder in Path(gettempdir()).glob(f"{LOGS}*"):
         with suppress(OSError), (folder / LOCK).open("r+") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -91,10 +91,10 @@ def _remove_left_behind() -> None:
 
 
 def _environment(processes: int) -> dict[str, str]:
-    """Return the ranks' environment: the cores divided evenly among them, and threads that sleep while they wait,
-    unless the user has set otherwise. Spinning threads make a step many times slower when anything else runs on the
-    machine. Modules are not imported from the current folder, whatever its files are called. Lines are not held back:
-    torchrun does not flush what it passes on, and a training whose progress is not seen counts as stalled."""
+    """Return the ranks' environment: the cores are divided evenly among them, and waiting threads sleep, unless the
+    user has set otherwise. Spinning threads make a step many times slower when anything else runs on the machine.
+    Modules are never imported from the current folder, whatever its files are called. Output is unbuffered: torchrun
+    does not flush what it passes on, and a training without visible progress counts as stalled."""
     threads = max(1, len(os.sched_getaffinity(0)) // processes)
     own = {"PYTHONSAFEPATH": "1", "PYTHONUNBUFFERED": "1"}
     return {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", **os.environ, **own}
@@ -111,7 +111,7 @@ def _follow(agent: "subprocess.Popen[str]", log: logging.Logger) -> None:
 
 
 def _stop(agent: "subprocess.Popen[str]") -> None:
-    """Let torchrun end its ranks; kill it, and them with it, if it does not."""
+    """Ask torchrun to end its ranks; if it does not, kill it, and thereby them."""
     agent.terminate()
     try:
         agent.wait(timeout=GRACE_S)
@@ -121,7 +121,7 @@ def _stop(agent: "subprocess.Popen[str]") -> None:
 
 
 def _error(module: str, logs: Path, ended: int) -> Exception:
-    """Build the exception from torchrun's exit code and its report of the first rank that failed."""
+    """Build the exception from torchrun's exit code and its report of the first failed rank."""
     if ended < 0:
         return LostWorkerError(f"{module}: torchrun was killed by {signal.Signals(-ended).name}")
     if not (logs / FAILURE).exists():

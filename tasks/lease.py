@@ -1,13 +1,14 @@
-"""A lease of work among machines: who works on an artifact, as long as they show that they are alive.
+"""A lease by which machines divide work: one works on an artifact as long as it shows that it is alive.
 
     <stage>/<key>.lease.<turn>    who works on the artifact and where, and a count that goes up; or FREE, once given up
 
-Turns are numbered from 0. A turn is taken by making its object, which the file system allows one worker only. The owner
-changes it every BEAT_S. The next turn may be taken once the last is FREE, or has not changed for EXPIRY_S by the clock
-of the one who waits: clocks of machines are not compared. If the owner ran where this one runs, it may be taken as soon
-as its process is gone. What is finished needs no lease, and its turns are removed.
+Turns are numbered from 0. A worker takes a turn by creating its object, which the file system allows only one worker to
+do. The owner changes it every BEAT_S. The next turn may be taken once the last one is FREE or has not changed for
+EXPIRY_S. That time is measured by the waiting worker's clock, so that clocks of different machines are never compared.
+If the owner ran in the same place as the waiting worker, the turn may be taken as soon as its process is gone. Finished
+work needs no lease, and its turns are removed.
 
-A turn is not taken back from an owner who was silent for too long and goes on: then two compute the same.
+An owner who was silent for too long and then continues is not stopped: two workers then compute the same artifact.
 """
 
 import logging
@@ -34,7 +35,7 @@ FREE = b"free"
 def leased(bucket: Bucket, name: str) -> Iterator[bool]:
     """Hold the lease of an artifact, and give it up if the work inside fails.
 
-    Yields False, without the lease, once another worker that held it has ended or was faster: its result may be there.
+    Yields False, without the lease, if another worker that held it has ended or was faster: its result may be there.
     """
     turn = _take(bucket, name)
     if turn is None:
@@ -50,7 +51,7 @@ def leased(bucket: Bucket, name: str) -> Iterator[bool]:
     finally:
         ended.set()
         beats.join()
-        with suppress(BucketError, InputError):  # else it expires
+        with suppress(BucketError, InputError):  # otherwise it expires
             if finished:
                 for taken in range(turn, -1, -1):  # the last one first: turns are counted up to the first gap
                     bucket.remove(_note(name, taken))
@@ -59,7 +60,7 @@ def leased(bucket: Bucket, name: str) -> Iterator[bool]:
 
 
 def _take(bucket: Bucket, name: str) -> int | None:
-    """Return the turn that this worker got, None if another one has it, or had it and ended."""
+    """Return the turn that this worker got, or None if another worker has it, or had it and has ended."""
     turn, text = _last(bucket, name)
     if text != FREE and turn >= 0 and not _expires(bucket, name, turn, text):
         return None
@@ -67,7 +68,7 @@ def _take(bucket: Bucket, name: str) -> int | None:
 
 
 def _last(bucket: Bucket, name: str) -> tuple[int, bytes]:
-    """Return the last turn that was taken, and its text; -1 if none was."""
+    """Return the last turn that was taken, and its text; -1 if none was taken."""
     turn, text = -1, FREE
     while (following := bucket.read_note(_note(name, turn + 1))) is not None:
         turn, text = turn + 1, following
@@ -75,7 +76,7 @@ def _last(bucket: Bucket, name: str) -> tuple[int, bytes]:
 
 
 def _expires(bucket: Bucket, name: str, turn: int, text: bytes) -> bool:
-    """Wait for the owner of a turn; return whether it fell silent, or is gone."""
+    """Wait for the owner of a turn; return whether it fell silent or is gone."""
     log.info("waiting for %s, which works on %s", printable(text.decode(errors="replace").partition(" ")[0]), name)
     seen_s = time.monotonic()
     while time.monotonic() - seen_s < EXPIRY_S:
@@ -107,8 +108,8 @@ def _text(count: int) -> bytes:
 
 
 def _is_gone(text: bytes) -> bool:
-    """Return whether an owner by its text ran in this place, and does no more. A number that another process has got
-    meanwhile counts as alive."""
+    """Return whether the owner named by this text ran in this place and no longer runs. If another process has got its
+    number meanwhile, it counts as alive."""
     owner, _, rest = text.decode(errors="replace").partition(" ")
     number = owner.rpartition(":")[2]
     return rest.partition(" ")[0] == _place() and number.isdecimal() and not Path(f"/proc/{number}").exists()
@@ -116,7 +117,7 @@ def _is_gone(text: bytes) -> bool:
 
 @cache
 def _place() -> str:
-    """Return what numbers of processes refer to: this start of this machine, and its name space."""
+    """Return the scope of process numbers: this boot of this machine, and its name space."""
     boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     return f"{boot}/{os.stat('/proc/self/ns/pid').st_ino}"
 

@@ -1,10 +1,10 @@
 """The ledger of a watched folder: which captures were started, by their content.
 
-<store>/ingested/<digest>         the folder and the flow run of a capture that was started
-<store>/ingested/<digest>.lost    the flow run that found its folder missing; the capture may be started again
-<store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
-<store>/ingested/new-<listing>    a listing in a bucket that is not started yet, since when it has been the same
-<store>/ingested/id               random: the same key in another ledger is another run
+    <store>/ingested/<digest>         the folder and the flow run of a capture that was started
+    <store>/ingested/<digest>.lost    the flow run that did not find its folder; the capture may be started again
+    <store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
+    <store>/ingested/new-<listing>    a listing in a bucket that is not started yet; written when it was first seen
+    <store>/ingested/id               random, so that the same key in another ledger is another run
 """
 
 import time
@@ -26,29 +26,30 @@ class Ledger:
 
     @staticmethod
     def of(store: Path) -> "Ledger":
-        """Return a store's ledger, which is made if there is none."""
+        """Return a store's ledger; create it if there is none."""
         root = store.resolve() / "ingested"
         root.mkdir(parents=True, exist_ok=True)
         return Ledger(root)
 
     def knows(self, digest: str) -> bool:
-        """Return whether a capture was started, and not lost since."""
+        """Return whether a capture was started and has not been lost since."""
         return (self.root / digest).exists()
 
     def seen(self, listing: str) -> bool:
-        """Return whether a folder of this listing was read, and its capture started, before."""
+        """Return whether a folder with this listing was read before and its capture was started."""
         path = self.root / listing
         return path.exists() and self.knows(path.read_text(errors="replace").strip() or "none")
 
     def stood_s(self, listing: str) -> float:
-        """Return for how long a listing has been the same, by this machine's clock: 0 when it is asked about first."""
+        """Return for how long a listing has been the same, in seconds by this machine's clock: 0 on the first call for
+        it."""
         path = self.root / f"new-{listing}"
         if not path.exists():
             replace_text(path, "")
         return time.time() - path.stat().st_mtime
 
     def note_seen(self, listing: str, digest: str) -> None:
-        """Note the content of a folder of this listing."""
+        """Note the content of a folder with this listing."""
         replace_text(self.root / listing, digest)
         (self.root / f"new-{listing}").unlink(missing_ok=True)
 
@@ -58,8 +59,8 @@ class Ledger:
         (self.root / f"{digest}{LOST}").unlink(missing_ok=True)
 
     def start_key(self, digest: str) -> str:
-        """Return the idempotency key of a capture's run: the same until the start is noted, another after a run was
-        lost and in another ledger, because Prefect returns the finished run of a key that it knows."""
+        """Return the idempotency key of a capture's run. It stays the same until the start is noted, and changes after
+        a run was lost and in another ledger, because Prefect returns the finished run of a key that it knows."""
         identity, lost = self.root / "id", self.root / f"{digest}{LOST}"
         if not identity.exists():
             replace_text(identity, uuid4().hex)
@@ -67,8 +68,8 @@ class Ledger:
 
 
 def forget(store: Path, capture: Path | str) -> None:
-    """Free the capture that was started from a folder or URL where it is no longer, so that the next look starts it
-    from wherever it lies now."""
+    """Release the capture that was started from a folder or URL where it no longer is, so that the next look starts it
+    from where it is now."""
     missing = capture if isinstance(capture, str) else str(capture.absolute())
     for record in list(_records(store)):
         folder, _, run = record.read_text(errors="replace").partition("\n")

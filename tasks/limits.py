@@ -1,8 +1,8 @@
-"""Time limits: a stage that makes no progress for its limit is ended, and the reason is said in one line.
+"""Time limits: a stage that makes no progress for its limit is ended, with the reason in one line.
 
-An alarm raises StalledError in the main thread, which ends Python code, and code that waits. Code in C that never comes
-back to Python is ended with its whole process by the watchdog of faulthandler, which needs no interpreter and says
-where it stood; a worker then reports the run as crashed.
+An alarm raises StalledError in the main thread, which ends Python code, including code that waits. C code that never
+returns to Python is ended, with its whole process, by the watchdog of faulthandler. That needs no interpreter and
+prints where the process was stuck; a worker then reports the run as crashed.
 """
 
 import faulthandler
@@ -24,7 +24,7 @@ _settings: ContextVar[LimitSettings] = ContextVar("limits")
 
 
 class StalledError(RuntimeError):
-    """A stage made no progress for its limit. retryable: it would go on from where it was."""
+    """A stage made no progress for its limit. retryable: a retry would continue from where it was."""
 
     def __init__(self, message: str, retryable: bool) -> None:
         super().__init__(message)
@@ -32,7 +32,7 @@ class StalledError(RuntimeError):
 
 
 def set_limits(settings: LimitSettings) -> None:
-    """Apply these limits to the stages that run from here on in this context."""
+    """Apply these limits to the stages that run from now on in this context."""
     _settings.set(settings)
 
 
@@ -42,27 +42,27 @@ def current_limits() -> LimitSettings:
 
 
 def limit_s(images: int) -> float:
-    """Return for how long a stage that works on this many images may make no progress."""
+    """Return the seconds for which a stage that works on this many images may make no progress."""
     settings = current_limits()
     return settings.stage_s + settings.image_s * images
 
 
 @contextmanager
 def limited(stage: str, images: int, resumable: bool) -> Iterator[None]:
-    """Raise StalledError in the code inside if it reports no progress for the stage's limit; where that does not end
-    it, end this process. Outside the main thread, where nothing can be raised, only the latter."""
+    """Raise StalledError in the code inside if it reports no progress for the stage's limit; if that does not end it,
+    end this process. Outside the main thread, where nothing can be raised, only end the process."""
     patience_s, last = limit_s(images), Progress("", 0, 0)
     armed_s = time.monotonic()
     main = threading.current_thread() is threading.main_thread()
 
     def arm() -> None:
-        if main:  # whichever thread reports
+        if main:  # whichever thread reports progress
             signal.setitimer(signal.ITIMER_REAL, patience_s)
         faulthandler.dump_traceback_later(patience_s + GRACE_S, exit=True, file=sys.__stderr__ or 2)
 
     def rearm(progress: Progress) -> None:
         nonlocal armed_s, last
-        if progress == last:  # said again, by who waits for others
+        if progress == last:  # repeated by a process that waits for others
             return
         last = progress
         if time.monotonic() - armed_s > REARM_S:
@@ -90,7 +90,7 @@ def limited(stage: str, images: int, resumable: bool) -> Iterator[None]:
 
 
 def _place(frame: FrameType | None) -> str:
-    """Return module and line of this project's code in which the stage stood."""
+    """Return the module and the line of this project's code that the stage was executing."""
     while frame is not None:
         name = frame.f_globals.get("__name__", "")
         if name.split(".")[0] in ("hnerf", "tasks"):

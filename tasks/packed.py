@@ -1,6 +1,7 @@
-"""Artifacts as one file: a tar archive of a manifest and of each file once. All members are named by their SHA-256.
+"""Artifacts packed into one file: a tar archive of a manifest and of each distinct file once. Members are named by
+their SHA-256.
 
-Paths come from the manifest alone, which is checked as a whole first: so nothing in an archive can name a place outside
+Paths come only from the manifest, all of which is checked first, so that nothing in an archive can name a place outside
 the store.
 """
 
@@ -25,8 +26,8 @@ MANIFEST = re.compile(r"[0-9a-f]{64}\.json")
 MAX_MANIFEST_BYTES = 64 << 20  # 200 bytes a file
 BLOCK = tarfile.BLOCKSIZE
 CHUNK_BYTES = 1 << 20
-MAX_PATH_BYTES, MAX_NAME_BYTES = 1024, 255  # the latter of a folder or file
-SPARE_BYTES = 1 << 30  # of the disk, which an archive must leave free
+MAX_PATH_BYTES, MAX_NAME_BYTES = 1024, 255  # the latter of a single folder or file
+SPARE_BYTES = 1 << 30  # on the disk, which an archive must leave free
 
 Name = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
@@ -43,7 +44,7 @@ class ArchivedFile(Section):
 
 
 class ArchivedArtifact(Section):
-    """An artifact's record; files by their path in its folder."""
+    """An artifact's record. files: by their path in its folder."""
 
     files: dict[str, ArchivedFile]
     metrics: dict[str, float] = Field(default_factory=dict)
@@ -64,18 +65,18 @@ class ArchivedArtifact(Section):
 
 
 class Contents(Section):
-    """What an archive holds: artifacts by name."""
+    """The contents of an archive: artifacts by name."""
 
     artifacts: dict[Name, ArchivedArtifact]
 
     def sizes_bytes(self) -> dict[str, int]:
-        """Return the size of each file by its digest."""
+        """Return the size of each file, by its digest."""
         files = [file for artifact in self.artifacts.values() for file in artifact.files.values()]
         return {file.sha256: file.size_bytes for file in files}
 
     def unpacked_bytes(self) -> int:
-        """Return the size of the unpacked artifacts. Every path counts, and not only every file: each is read to check
-        its digest."""
+        """Return the size of the unpacked artifacts. A file counts once for each of its paths, since every path is read
+        to check its digest."""
         return sum(file.size_bytes for one in self.artifacts.values() for file in one.files.values())
 
 
@@ -83,7 +84,7 @@ Kind = TypeVar("Kind", bound=Contents)
 
 
 def archived(artifacts: Iterable[Artifact]) -> dict[str, ArchivedArtifact]:
-    """Return what a manifest says of artifacts."""
+    """Return the manifest's description of artifacts."""
     return {
         one.name: validated(ArchivedArtifact, one.model_dump(include={"files", "metrics", "inputs"}), one.root)
         for one in artifacts
@@ -106,12 +107,12 @@ def pack(contents: Contents, store: Store, out: Path) -> None:
 
 
 def manifest_name(text: bytes) -> str:
-    """Return the name of the member that a manifest is."""
+    """Return the name of the member that holds a manifest."""
     return f"{hashlib.sha256(text).hexdigest()}.json"
 
 
 def read_contents(kind: type[Kind], archive: IO[bytes], where: str) -> Kind:
-    """Read the manifest at the beginning of an archive, called `where` in errors."""
+    """Read the manifest at the beginning of an archive. where: the archive's name in errors."""
     name, size_bytes = next(_members(archive, where), ("", 0))
     if not MANIFEST.fullmatch(name) or size_bytes > MAX_MANIFEST_BYTES:
         raise InputError(f"{where}: does not begin with a manifest; give an archive of `hnerf store export`")
@@ -127,14 +128,14 @@ def read_contents(kind: type[Kind], archive: IO[bytes], where: str) -> Kind:
 
 
 def require_room(wanted_bytes: int, folder: Path, where: str) -> None:
-    """Raise NoRoomError if so many bytes would fill the disk."""
+    """Raise NoRoomError if this many bytes would fill the disk."""
     free = shutil.disk_usage(folder).free
     if wanted_bytes > free - SPARE_BYTES:
         raise NoRoomError(f"{where}: takes {wanted_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; make room")
 
 
 def unpack(archive: IO[bytes], contents: Contents, scratch: Path, where: str) -> None:
-    """Write each file that follows the manifest into `scratch` under its digest, which is checked."""
+    """Write each file that follows the manifest into `scratch`, named by its digest, which is checked."""
     missing = contents.sizes_bytes()
     for digest, size_bytes in _members(archive, where):
         if missing.pop(digest, -1) != size_bytes:
@@ -153,7 +154,7 @@ def unpack(archive: IO[bytes], contents: Contents, scratch: Path, where: str) ->
 
 
 def place(store: Store, name: str, one: ArchivedArtifact, scratch: Path) -> Artifact:
-    """Take an artifact's files out of `scratch` and record it; the lock of its key must be held."""
+    """Move an artifact's files from `scratch` into the store and record it; the lock of its key must be held."""
     stage, key = name.split("/")
     partial = store.path(stage, key, ".partial")
     remove(partial)
@@ -172,10 +173,11 @@ def _add(archive: tarfile.TarFile, name: str, size_bytes: int, content: IO[bytes
 
 
 def _members(archive: IO[bytes], where: str) -> Iterator[tuple[str, int]]:
-    """Yield name and size of each member; its content must be read, up to the next block, before the next is asked for.
+    """Yield the name and the size of each member. Its content must be read, up to the next block, before the next one
+    is requested.
 
-    Only plain files are members: no links, devices, folders, or headers of variable size, which a general reader takes
-    into memory.
+    Only plain files are accepted as members: no links, devices or folders, nor headers of variable size, which a
+    general reader would load into memory.
     """
     while block := archive.read(BLOCK):
         if not any(block):

@@ -1,6 +1,6 @@
-"""Which artifacts running processes use, so that none is removed under them.
+"""The artifacts that running processes use, recorded so that none is removed while in use.
 
-<store>/.running/<random>  lines `<stage>/<key>`; locked (flock) by a process while it lives, released by the kernel
+    <store>/.running/<random>  lines `<stage>/<key>`; locked (flock) by a process while it lives, released by the kernel
 """
 
 import errno
@@ -18,7 +18,7 @@ _own: dict[tuple[int, Path], IO[str]] = {}  # of this process and store; open un
 
 
 def pin(store: Path, name: str) -> None:
-    """Note that this process uses an artifact from here on; nothing is noted in a store that may only be read."""
+    """Note that this process uses an artifact from now on. In a read-only store, nothing is noted."""
     with unless_read_only():
         file = _own.get((os.getpid(), store)) or _begin(store)
         file.write(f"{name}\n")
@@ -26,12 +26,12 @@ def pin(store: Path, name: str) -> None:
 
 
 def pinned(store: Path) -> set[str]:
-    """Return the names of the artifacts that living processes use; remove what dead ones left."""
+    """Return the names of the artifacts that living processes use; remove the files of dead ones."""
     names: set[str] = set()
     for path in (store / FOLDER).glob("[0-9a-f]*"):
         try:
-            file = path.open("r+")  # NFS locks only what may be written
-        except FileNotFoundError:  # another looked at the same time
+            file = path.open("r+")  # NFS locks only files opened for writing
+        except FileNotFoundError:  # removed by another process at the same time
             continue
         except OSError as error:
             if error.errno not in READ_ONLY:
@@ -51,7 +51,7 @@ def pinned(store: Path) -> set[str]:
 
 @contextmanager
 def unless_read_only() -> Iterator[None]:
-    """Leave out what is done inside in a store that may only be read."""
+    """Skip what is done inside if the store is read-only."""
     try:
         yield
     except OSError as error:
@@ -60,7 +60,7 @@ def unless_read_only() -> Iterator[None]:
 
 
 def _begin(store: Path) -> IO[str]:
-    """Open this process's file, which gets its name once it is locked."""
+    """Open this process's file, which gets its final name once it is locked."""
     name = uuid4().hex
     beside, path = store / FOLDER / f".{name}", store / FOLDER / name
     beside.parent.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Cache and retry policy: when a stage's result can be reused, and when a failed stage is tried again."""
+"""Cache and retry policy: when a stage's result can be reused, and when a failed stage is retried."""
 
 import errno
 import hashlib
@@ -29,8 +29,8 @@ Input = Artifact | Source | Section | str | tuple[str, ...] | tuple[int, ...] | 
 
 
 def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
-    """Return the key of a stage's artifact: a digest of the task's name and version, its inputs' content and its own
-    settings."""
+    """Return the key of a stage's artifact: a digest of the task's name and version, the content of its inputs, and its
+    own settings."""
     described = {name: _key_value(value) for name, value in inputs.items()}
     text = json.dumps({"task": task, "version": version, "inputs": described}, sort_keys=True, default=_file_digest)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -49,14 +49,15 @@ def _key_value(value: Input | int) -> Any:
         return value
     if isinstance(value, Section):
         return value.key_values()
-    if isinstance(value, Source) and not value.is_truth:  # a person may be called as the folder is
+    if isinstance(value, Source) and not value.is_truth:  # a person may be named after the folder
         return [value.name, value.digest]
     return value.digest
 
 
 def _file_digest(path: Path) -> str:
-    """Return the digest of a file that a setting names, wherever it lies, and of files beside it whose names begin with
-    its name, like `seg.onnx.data` (external weights). A missing file counts by its path; the stage refuses it."""
+    """Return the digest of a file that a setting names, wherever it is, and of files next to it whose names begin with
+    its name, like `seg.onnx.data` (external weights). A missing file is represented by its path; the stage refuses
+    it."""
     if not path.is_file():
         return str(path)
     beside = sorted(p for p in path.parent.iterdir() if p.name.startswith(path.name) and p != path and p.is_file())
@@ -66,16 +67,16 @@ def _file_digest(path: Path) -> str:
 class StorePolicy(CachePolicy):
     """Prefect's cache policy, as a view of the artifact store.
 
-    A task run counts as cached if Prefect's record of it agrees with the store. The record of an artifact that was
-    damaged, deleted or made anew is dropped here, so that the task runs again. With a bucket, Prefect keeps no records:
-    the task looks whether its artifact is there, too.
+    A task run counts as cached if Prefect's record of it agrees with the store. If an artifact was damaged, deleted or
+    made again, its record is dropped here, so that the task runs again. With a bucket, Prefect keeps no records; the
+    task itself then looks for its artifact in the store and in the bucket.
     """
 
     def compute_key(
         self, task_ctx: TaskRunContext, inputs: dict[str, Any], flow_parameters: dict[str, Any], **kwargs: Any
     ) -> str | None:
-        """Return the name of Prefect's record: the stage's key and a digest of the store's path, so that two stores do
-        not share records. None with a bucket."""
+        """Return the name of Prefect's record: the stage's key and a digest of the store's path, so that different
+        stores do not share records. Return None with a bucket."""
         if os.environ.get(VARIABLE):
             return None
         store: Store = inputs["store"]
@@ -95,19 +96,19 @@ def is_transient(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
 
 
 def is_retryable(error: object) -> bool:
-    """Return whether a retry may succeed: after failed input or output, timeouts and lost workers only, and where a
-    stage that stood still would go on from a checkpoint."""
+    """Return whether a retry may succeed: only after failed input or output, timeouts and lost workers, or if a stalled
+    stage would continue from a checkpoint."""
     if isinstance(error, StalledError):
         return error.retryable
     return isinstance(error, OSError | LostWorkerError) and not is_permanent(error)
 
 
 def is_of_the_machine(error: Exception) -> bool:
-    """Return whether an error is no result of a study: a full disk, a killed worker, a place of results that is
-    away."""
+    """Return whether an error comes from the machine and is no result of a study: a full disk, a killed worker, or a
+    store or bucket that cannot be reached."""
     return isinstance(error, PlaceError) or is_retryable(error)
 
 
 def is_permanent(error: Exception) -> bool:
-    """Return whether input or output failed for a reason that lies in the path, so that no retry can succeed."""
+    """Return whether input or output failed because of the path itself, so that no retry can succeed."""
     return isinstance(error, PERMANENT_ERRORS) or (isinstance(error, OSError) and error.errno in PERMANENT_ERRNOS)

@@ -18,7 +18,7 @@ REPEAT = "If the folder is not to blame, repeat its flow run: prefect flow-run r
 
 
 def note(capture: Path, why: str, remedy: str = REMEDY) -> None:
-    """Say why a capture gave no result, and what to do."""
+    """Write why a capture gave no result, and what to do."""
     path = _path(capture)
     path.parent.mkdir(exist_ok=True)
     text = f"{printable(capture.name)}: {printable(why)}\n\n{remedy}\n"
@@ -27,19 +27,19 @@ def note(capture: Path, why: str, remedy: str = REMEDY) -> None:
 
 
 def note_run(capture: Path | str, store: Path, why: str) -> None:
-    """Say why a run gave no result, if its capture was started from a watched folder (not in a bucket)."""
+    """Write why a run gave no result, if its capture was started from a watched folder (not one in a bucket)."""
     if isinstance(capture, Path) and was_started(store, capture):
-        with suppress(OSError):  # a folder that may only be read, or is gone
+        with suppress(OSError):  # a folder that is read-only, or gone
             note(capture, why, f"{REMEDY} {REPEAT}")
 
 
 def clear(capture: Path) -> None:
-    """Take back what was said about a capture."""
+    """Remove the note about a capture."""
     _path(capture).unlink(missing_ok=True)
 
 
 def clear_removed(folder: Path) -> None:
-    """Take back what was said about captures that are no longer in the watched folder; links are not followed."""
+    """Remove the notes about captures that are no longer in the watched folder; links are not followed."""
     if (folder / FOLDER).is_symlink():
         return
     for path in (folder / FOLDER).glob("*.txt"):
@@ -48,7 +48,7 @@ def clear_removed(folder: Path) -> None:
 
 
 def _path(capture: Path) -> Path:
-    """Return the place of the note. Raises OSError if a link leads elsewhere from there."""
+    """Return the path of the note. Raises OSError if a link there leads elsewhere."""
     path = capture.parent / FOLDER / f"{capture.name}.txt"
     if path.parent.is_symlink():
         raise NotADirectoryError(f"{path.parent}: is a symbolic link; remove it")

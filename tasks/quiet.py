@@ -1,4 +1,4 @@
-"""Refusals in Prefect's logs: one line in place of a traceback for the task and another for the flow."""
+"""Expected errors in Prefect's logs: one line instead of one traceback for the task and another for the flow."""
 
 import logging
 
@@ -11,13 +11,14 @@ LOGGERS = ("prefect.task_runs", "prefect.flow_runs", "prefect.engine", "prefect.
 
 
 def without_traceback(record: logging.LogRecord) -> bool:
-    """Take the traceback from a record of an error whose message says all (a filter of logging); keep every record."""
+    """Remove the traceback from the log record of an error whose message is sufficient (a logging filter); keep all
+    records."""
     if record.exc_info and isinstance(record.exc_info[1], InputError | BucketError | RankFailedError | StalledError):
         record.exc_info = record.exc_text = None
     return True
 
 
 def quieten() -> None:
-    """Apply this to the logs of flow and task runs."""
+    """Apply the filter to the logs of flow and task runs."""
     for name in LOGGERS:
         logging.getLogger(name).addFilter(without_traceback)

@@ -1,6 +1,6 @@
-"""Captures in a bucket: what is there, and the stage that fetches one into the store.
+"""Captures in a bucket: a list of them, and the stage that fetches one into the store.
 
-A capture is known by the names, sizes and ETags of its files.
+A capture is identified by the names, sizes and ETags of its files.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ from tasks.store import Store
 
 
 class NothingThereError(InputError):
-    """No file lies at a URL."""
+    """There is no file at a URL."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class RemoteCapture:
 
 
 def remote_captures(folder: str) -> Iterator[RemoteCapture]:
-    """Yield the captures in the subfolders of a folder, sorted."""
+    """Yield the captures in the subfolders of a folder, sorted by name."""
     bucket = Bucket.at(folder)
     for name in bucket.folders():
         files = tuple(bucket.files(name))
@@ -49,7 +49,7 @@ def remote_captures(folder: str) -> Iterator[RemoteCapture]:
 
 
 def remote_capture(url: str) -> RemoteCapture:
-    """Return the capture of a URL. Raises NothingThereError if no file is there."""
+    """Return the capture at a URL. Raises NothingThereError if there is no file."""
     capture = RemoteCapture(url.rstrip("/"), tuple(Bucket.at(url).files("")))
     if not capture.files or capture.name in (".", ".."):
         raise NothingThereError(f"{url}: no such folder; give the capture's folder")
@@ -57,13 +57,13 @@ def remote_capture(url: str) -> RemoteCapture:
 
 
 def fetched(store: Store, capture: RemoteCapture) -> Path:
-    """Return a folder of the store with the capture's files, fetched unless they are there."""
+    """Return a folder of the store with the capture's files, which are fetched if they are missing."""
     return fetch(store, capture.url, capture.digest).root / capture.name
 
 
 @stage("fetched", version="1", shared=False)
 def fetch(out: Path, url: str, digest: str) -> dict[str, float]:
-    """Fetch the capture of a URL and a digest from a bucket."""
+    """Fetch the capture at a URL, with this digest, from a bucket."""
     capture, bucket = remote_capture(url), Bucket.at(url)
     changed = InputError(f"{url}: has changed since it was listed; give the same command again")
     size_bytes = sum(file.size_bytes for file in capture.files)

@@ -23,8 +23,8 @@ def segment(
     earlier: Artifact | None,
     settings: SegmentationSettings,
 ) -> dict[str, float]:
-    """Write masks of the person: given, learned, from clean plates, or around a rough fit. The report holds how far
-    their edges moved since each earlier round."""
+    """Write masks of the person: given ones, or from a learned model, from clean plates, or around a rough fit. The
+    report holds how far their edges moved in each round."""
     body = BodyFit.load(rough_fit.root) if rough_fit else None
     masks = segment_person(calibrated_capture(recording, calibration), body, settings)
     if earlier is None:
@@ -38,13 +38,13 @@ def segment(
 
 
 def converged(segmentation: Artifact, settings: SegmentationSettings) -> bool:
-    """Return whether this round hardly moved the masks' edges."""
+    """Return whether this round hardly moved the edges of the masks."""
     return segmentation.metrics.get(EDGE_MOVEMENT, float("inf")) < settings.still_px
 
 
 def needs_body(recording: Artifact, settings: SegmentationSettings) -> bool:
-    """Return whether segmentation needs a fitted body: some camera has neither masks nor a clean plate, and there is
-    neither a learned model nor a network that detected people; or there are no keypoints."""
+    """Return whether segmentation needs a fitted body. It does if there are no keypoints, or if some camera has neither
+    masks nor a clean plate and there is neither a learned model nor a network that detected people."""
     capture = Capture.load(recording.root)
     first = capture.train_frames[0]
     unmasked = (capture.background(c) is None and capture.given_mask(c, first) is None for c in capture.train_cameras)

@@ -1,9 +1,9 @@
-"""Artifacts shared by the stores of many machines through a bucket:
+"""Artifacts that the stores of many machines share through a bucket.
 
     <bucket>/<stage>/<key>.tar    an artifact as one file (tasks/packed.py)
 
-A store takes from there what it lacks, and puts there what it has made. Whoever may write into the bucket decides what
-results are; nothing in it is run, and nothing leads out of the store.
+A store takes from the bucket what it lacks, and puts there what it has made. Whoever can write into the bucket can
+determine results; but nothing in it is executed, and nothing in it leads out of the store.
 """
 
 import logging
@@ -26,11 +26,12 @@ PACKED = "packed"
 def get_or_compute(
     bucket: Bucket, store: Store, stage: str, key: str, compute: Callable[[], Artifact], checkpoint: str = ""
 ) -> Artifact:
-    """Return an artifact of the store; if it is not there, that of the bucket, or else what `compute` puts into the
-    store. It is then in both.
+    """Return the artifact from the store, else from the bucket, else compute it with `compute`, which puts it into the
+    store. Afterwards it is in both.
 
-    If several machines want the same, one computes it and the others wait; if that one is lost, another goes on from
-    its checkpoint, a file of this name in the folder of unfinished work. Raises BucketError if the bucket is away.
+    If several machines want the same artifact, one computes it and the others wait. If that one is lost, another
+    continues from its checkpoint. checkpoint: the name of that file in the folder of unfinished work. Raises
+    BucketError if the bucket cannot be reached.
     """
     name = f"{stage}/{key}"
     if here := store.find(stage, key):
@@ -48,7 +49,7 @@ def get_or_compute(
 
 
 def _fetch(bucket: Bucket, store: Store, stage: str, key: str) -> Artifact | None:
-    """Put the bucket's artifact into the store, unless that has it; return None if it is not there, or damaged."""
+    """Put the bucket's artifact into the store, unless the store has it. Return None if it is missing or damaged."""
     name = f"{stage}/{key}"
     where = bucket.where(_object(name))
     with store.scratch(stage, key) as scratch:
@@ -70,12 +71,12 @@ def _fetch(bucket: Bucket, store: Store, stage: str, key: str) -> Artifact | Non
             log.warning("%s (%s is computed again)", error, stage)
             return None
         place(store, name, contents.artifacts[name], scratch)
-        store.path(stage, key, ".shared").unlink(missing_ok=True)  # of work that another machine finished
+        store.path(stage, key, ".shared").unlink(missing_ok=True)  # it belonged to work that another machine finished
     return store.find(stage, key)
 
 
 def _unpacked(scratch: Path, name: str, where: str) -> Contents:
-    """Unpack an object with the artifact of this name. Raises InputError if it is damaged."""
+    """Unpack an object that holds the artifact of this name. Raises InputError if it is damaged."""
     with (scratch / PACKED).open("rb") as archive:
         contents = read_contents(Contents, archive, where)
         if list(contents.artifacts) != [name]:
@@ -86,7 +87,7 @@ def _unpacked(scratch: Path, name: str, where: str) -> Contents:
 
 
 def _put_if_missing(bucket: Bucket, store: Store, artifact: Artifact) -> Artifact:
-    """Put an artifact of the store into the bucket unless that has it; return it."""
+    """Put an artifact of the store into the bucket unless the bucket has it; return the artifact."""
     if bucket.size_bytes(_object(artifact.name)) is None:
         _put(bucket, store, artifact)
     return artifact

@@ -1,8 +1,9 @@
-"""The checkpoint of unfinished work, shared through a bucket, so that another machine goes on where a lost one was.
+"""The checkpoint of unfinished work, shared through a bucket, so that another machine can continue where a lost one
+was.
 
     <bucket>/<stage>/<key>.checkpoint    the latest one, until the work is done
 
-Whoever takes the work over checks what is in it, as it does with one of its own.
+Whoever takes over the work checks the content of the checkpoint, as with its own.
 """
 
 import logging
@@ -27,9 +28,9 @@ Version = tuple[int, int] | None
 
 @contextmanager
 def shared_checkpoint(bucket: Bucket, store: Store, stage: str, key: str, file: str) -> Iterator[None]:
-    """Begin with the bucket's checkpoint if another machine put it there since this one last did, else with an own one;
-    while the work inside goes on, put new ones there. In the end, keep the last there if it is still needed here. file:
-    its name in the folder of unfinished work."""
+    """Start from the bucket's checkpoint if another machine has put one there since this machine last did, else from a
+    local one. While the work inside runs, upload new ones. At the end, keep the last one in the bucket if it is still
+    needed here. file: its name in the folder of unfinished work."""
     name, path = f"{stage}/{key}.checkpoint", store.path(stage, key, ".partial") / file
     known = store.path(stage, key, ".shared")
     with store.locked(stage, key):
@@ -49,8 +50,8 @@ def shared_checkpoint(bucket: Bucket, store: Store, stage: str, key: str, file: 
 
 
 def _fetch(bucket: Bucket, name: str, path: Path, known: Path) -> bool:
-    """Take the bucket's checkpoint, if there is one that this machine does not know; return whether it did. known: the
-    file with the digest of the one that this machine last put there, or took."""
+    """Take the bucket's checkpoint if there is one that this machine does not know; return whether it was taken. known:
+    the file with the digest of the checkpoint that this machine last uploaded or took."""
     if (size_bytes := bucket.size_bytes(name)) is None:
         return False
     if path.parent.is_symlink():
@@ -74,8 +75,8 @@ def _fetch(bucket: Bucket, name: str, path: Path, known: Path) -> bool:
 
 
 def _share(bucket: Bucket, name: str, path: Path, known: Path, shared: Version, ended: Event) -> None:
-    """Put each new checkpoint into the bucket, until the work has ended, and then the last one. shared: which one is
-    there already."""
+    """Upload each new checkpoint until the work has ended, then the last one. shared: the version that the bucket
+    already has."""
     last = False
     while not last:
         last = ended.wait(LOOK_S)
@@ -85,10 +86,10 @@ def _share(bucket: Bucket, name: str, path: Path, known: Path, shared: Version, 
 
 
 def _put(bucket: Bucket, name: str, path: Path, known: Path) -> None:
-    """Put the file that lies there now into the bucket, whatever replaces it meanwhile."""
+    """Upload the file that is at the path now, whatever replaces it meanwhile."""
     try:
         file = path.open("rb")
-    except FileNotFoundError:  # done: there is none any more
+    except FileNotFoundError:  # the work is done: there is none any more
         return
     with file:
         opened = Path(f"/dev/fd/{file.fileno()}")
@@ -97,7 +98,7 @@ def _put(bucket: Bucket, name: str, path: Path, known: Path) -> None:
 
 
 def _version(path: Path) -> Version:
-    """Return what changes with each new file at a path; None if there is none."""
+    """Return a value that changes with each new file at a path; None if there is no file."""
     try:
         found = path.stat()
     except FileNotFoundError:
@@ -106,7 +107,7 @@ def _version(path: Path) -> Version:
 
 
 def _attempt(act: Callable[[], None]) -> bool:
-    """Return whether bucket and disk let it be done; warn if not: the work goes on without."""
+    """Call `act`; return whether bucket and disk allowed it. If not, warn: the work continues without."""
     try:
         act()
     except (OSError, InputError) as error:

@@ -12,18 +12,18 @@ from hnerf.errors import InputError
 from tasks.store import sha256_of
 
 GROUND_TRUTH = "ground_truth"
-MAX_FILE_BYTES = 1 << 38  # a sparse file takes no disk, and hours to read
+MAX_FILE_BYTES = 1 << 38  # a sparse file takes no disk space, but hours to read
 
 
 def place(given: Path | str) -> Path | str:
-    """Return a path, or the URL of what is in a bucket; file:// names a path."""
+    """Return a path, or the URL of something in a bucket. file:// URLs become paths."""
     text = str(given).removeprefix("file://")
     return text if isinstance(given, str) and "://" in text else Path(text)
 
 
 class Source(BaseModel):
-    """Part of the capture folder `root`: the recording, or its ground truth. name: the folder's own; digest: SHA-256 of
-    the part's file names and bytes, wherever the folder lies."""
+    """Part of the capture folder `root`: the recording, or its ground truth. name: the folder's; digest: SHA-256 of the
+    part's file names and bytes, independent of where the folder is."""
 
     root: Path
     name: str
@@ -32,12 +32,12 @@ class Source(BaseModel):
 
 
 def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Source]:
-    """Return the recording and its ground truth: all files except those of `ground_truth/`, and only those. A
-    recording may also be one video, which has no ground truth.
+    """Return the recording and its ground truth: the files outside `ground_truth/`, and those inside. A recording may
+    also be a single video, which has no ground truth.
 
-    Hidden files do not count. A symbolic link counts by the path it holds: its target is either in the folder itself or
-    not part of it. Raises InputError if there is no such folder, a file cannot be read, or the store lies in the
-    capture, whose digest would then change with every run.
+    Hidden files do not count. A symbolic link counts as the path that it holds: its target is either in the folder
+    itself or not part of it. Raises InputError if there is no such folder, a file cannot be read, or the store is
+    inside the capture, whose digest would then change with every run.
     """
     folder = folder.resolve()
     if not folder.exists():
@@ -57,8 +57,8 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
 
 
 def require_unchanged(source: Source) -> None:
-    """Raise InputError unless the files of a recording or a ground truth are still those of its digest: what was read
-    of others must not be found under that key again."""
+    """Raise InputError if the files of a recording or a ground truth no longer match its digest: results from other
+    files must not be found under that key later."""
     files = _parts(source.root)[source.is_truth] if source.root.exists() else []
     if _digest(source.root, files) != source.digest:
         folder = source.root / GROUND_TRUTH if source.is_truth else source.root
@@ -66,16 +66,16 @@ def require_unchanged(source: Source) -> None:
 
 
 def capture_files(folder: Path) -> list[Path]:
-    """Return the files and symbolic links in a capture folder, sorted, without hidden ones and devices; a video alone
-    is its own file. Raises InputError if a folder cannot be read."""
+    """Return the files and symbolic links in a capture folder, sorted, without hidden ones and devices; for a single
+    video, the video. Raises InputError if a folder cannot be read."""
     if folder.is_file():
         return [folder]
     return sorted(Path(entry.path) for entry in entries(folder))
 
 
 def entries(folder: Path | str, hidden: bool = False) -> Iterator["os.DirEntry[str]"]:
-    """Yield the entries of these files, in no order, which know whether they are links without asking again; hidden:
-    yield hidden ones, too."""
+    """Yield the directory entries of these files, in no particular order. An entry knows whether it is a link without
+    another system call. hidden: include hidden ones."""
     waiting = [os.fspath(folder)]
     while waiting:
         try:
@@ -88,7 +88,7 @@ def entries(folder: Path | str, hidden: bool = False) -> Iterator["os.DirEntry[s
 
 
 def _parts(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files of the recording in a capture folder, and those of its ground truth."""
+    """Return the files of the recording in a capture folder, and the files of its ground truth."""
     files, truth = capture_files(folder), folder / GROUND_TRUTH
     return [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
 
@@ -104,7 +104,7 @@ def _digest(folder: Path, files: Iterable[Path]) -> str:
         except OSError as error:
             _refuse(error, path)
         line = f"{content} {path.relative_to(beside)}"
-        if "\n" in line:  # or two folders could have one digest
+        if "\n" in line:  # otherwise, two folders could have the same digest
             raise InputError(f"{path}: has a line break in its name, or in what it links to; rename it")
         listing.update(os.fsencode(f"{line}\n"))
     return listing.hexdigest()

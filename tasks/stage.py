@@ -1,4 +1,4 @@
-"""The cached task that every stage is."""
+"""The cached task from which every stage is made."""
 
 import inspect
 import json
@@ -25,7 +25,7 @@ quieten()
 
 P = ParamSpec("P")
 CAPTURE = "capture.json"  # of a recording, hnerf/capture/capture.py
-NETWORKS = "networks"  # beside a stage's own inputs, in its key
+NETWORKS = "networks"  # in a stage's key, in addition to its own inputs
 Write = Callable[Concatenate[Path, P], dict[str, float]]
 
 
@@ -33,12 +33,12 @@ Write = Callable[Concatenate[Path, P], dict[str, float]]
 class Stage(Generic[P]):
     """A function `write(out, inputs...)` that fills a folder, made into a cached task.
 
-    It is called as `stage(store, inputs...)`: within a flow run it is a Prefect task run; outside one it does the same
+    It is called as `stage(store, inputs...)`. Within a flow run it is a Prefect task run; elsewhere it does the same
     work through the same store, without a server.
 
     networks: files of hnerf.models that the stage uses if they are installed; the key depends on which ones are.
-    shared: through the bucket, if there is one; checkpoint: the file of unfinished work that is shared there, too, and
-    is no part of the artifact.
+    shared: whether the artifact is shared through the bucket, if there is one; checkpoint: the file of unfinished work
+    that is shared there, too, and is not part of the artifact.
     """
 
     write: Write[P]
@@ -95,7 +95,7 @@ class Stage(Generic[P]):
 
 
 def image_count(inputs: Iterable[Input]) -> int:
-    """Return how many images, frames times cameras, the largest recording among a stage's inputs has; 1 if there is
+    """Return the number of images (frames times cameras) of the largest recording among a stage's inputs; 1 if there is
     none."""
     roots = [one.root for one in artifacts_among(inputs) if (one.root / CAPTURE).is_file()]
     recordings = [json.loads((root / CAPTURE).read_bytes()) for root in roots]
@@ -104,6 +104,6 @@ def image_count(inputs: Iterable[Input]) -> int:
 
 
 def stage(name: str, version: str, **options: Any) -> Callable[[Write[P]], Stage[P]]:
-    """Make a function into a Stage with these options (decorator). Artifacts lie under `<store>/<name>/`; raise
-    `version` when the same inputs give another result."""
+    """Decorate a function to make it a Stage with these options. Artifacts are under `<store>/<name>/`; raise `version`
+    when the same inputs give a different result."""
     return lambda write: Stage(write, name, version, **options)

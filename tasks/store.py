@@ -1,19 +1,19 @@
 """The artifact store: each stage's output under a key that is derived from its inputs.
 
-    <store>/<stage>/<key>/          the files, put there by one rename
+    <store>/<stage>/<key>/          the files, put there by a single rename
     <store>/<stage>/<key>.json      the record: each file's SHA-256 and size, and a few metrics
     <store>/<stage>/<key>.partial/  work in progress
     <store>/<stage>/<key>.moving/   on its way into or out of a bucket (tasks/shared.py) or archive (tasks/archive.py)
-    <store>/<stage>/<key>.shared    which checkpoint of it a bucket has (tasks/shared_checkpoint.py)
-    <store>/<stage>/<key>.lock      locked (flock) while a process works on the key; the kernel releases it if that dies
+    <store>/<stage>/<key>.shared    which of its checkpoints a bucket has (tasks/shared_checkpoint.py)
+    <store>/<stage>/<key>.lock      locked (flock) by a process that works on the key; if it dies, the kernel unlocks it
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
-    <store>/subjects/<name>/.recording  the digest and the folder of the recording that these are of
-    <store>/<study>/<table>.recording  the same of a study's table, where <study> is ablations, benchmark or stability
+    <store>/subjects/<name>/.recording  the digest and the folder of the recording that these come from
+    <store>/<study>/<table>.recording  the same for a study's table, where <study> is ablations, benchmark or stability
     <store>/.running/                which artifacts each running process uses (tasks/pins.py)
 
-The record's time of change is that of its last use (tasks/garbage.py).
+The record's modification time is the time of its last use (tasks/garbage.py).
 
-The store alone decides what can be reused; Prefect's record of a task run is a view of it (tasks/policy.py).
+Only the store decides what can be reused; Prefect's record of a task run is a view of it (tasks/policy.py).
 """
 
 import errno
@@ -41,19 +41,19 @@ from tasks.pins import pin, unless_read_only
 log = logging.getLogger("hnerf.store")
 
 RECORDING = ".recording"  # under subjects/<name>: digest and folder of the recording
-SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving", ".shared")  # of what a key may have beside its lock
-MAX_RECORD_BYTES = 256_000_000  # a million files need half of that
-ATTEMPTS = 100  # to lock a key in a folder that others make and remove
+SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving", ".shared")  # a key may have, besides its lock
+MAX_RECORD_BYTES = 256_000_000  # a million files need half of this
+ATTEMPTS = 100  # to lock a key in a folder that other processes create and remove
 # In order: each stage is computed from those before it.
 STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
-OPTIONAL = {"detection", "hands"}  # of these, a run may do without
+OPTIONAL = {"detection", "hands"}  # stages that a run may skip
 
 NAME = re.compile(r"[a-z][a-z-]{0,30}/[0-9a-f]{32}")  # of an artifact
 SizeBytes = Annotated[int, Field(ge=0, lt=2**63)]  # of a file
 
 
 class StoredFile(BaseModel):
-    """The digest and size by which a file of an artifact is checked."""
+    """The digest and the size with which a file of an artifact is checked."""
 
     sha256: str
     size_bytes: SizeBytes
@@ -61,7 +61,7 @@ class StoredFile(BaseModel):
 
 class Artifact(BaseModel):
     """The finished output of one stage. files: by path relative to `root`; metrics: a few headline numbers; inputs:
-    `<stage>/<key>` of the artifacts that it was computed from, unknown in records of earlier versions."""
+    `<stage>/<key>` of the artifacts that it was computed from; records of earlier versions lack them."""
 
     stage: str
     root: Path
@@ -81,7 +81,7 @@ class Artifact(BaseModel):
         return hashlib.sha256(listing.encode()).hexdigest()
 
     def damaged_file(self) -> Path | None:
-        """Return the first recorded file that is missing or has changed, or None."""
+        """Return the first recorded file that is missing or has changed; None if there is none."""
         for name, file in self.files.items():
             path = self.root / name
             if not path.is_file() or path.stat().st_size != file.size_bytes or sha256_of(path) != file.sha256:
@@ -96,13 +96,15 @@ class Store:
     root: Path
 
     def exists(self) -> bool:
-        """Return whether anything was ever stored here: a folder without these is somebody else's."""
+        """Return whether anything was ever stored here. A folder without any of these subfolders belongs to somebody
+        else."""
         return any((self.root / name).is_dir() for name in ("subjects", "ingested", STAGES[0]))
 
     def find(self, stage: str, key: str) -> Artifact | None:
-        """Return the artifact if it is recorded and intact, else None. From here on this process uses it."""
+        """Return the artifact if it is recorded and intact, else None. From now on, it counts as used by this
+        process."""
         record = self.path(stage, key, ".json")
-        if not record.is_file():  # nor a pipe or a device, from which reading never ends
+        if not record.is_file():  # reading a pipe or a device would never end
             return None
         pin(self.root, f"{stage}/{key}")
         try:
@@ -118,14 +120,14 @@ class Store:
         return None
 
     def recorded(self, stage: str, key: str) -> Artifact | None:
-        """Return the artifact as its record describes it, whose files were not looked at; None if the record cannot be
-        read as one, is a link, or has more bytes than one needs. Raises FileNotFoundError if there is none."""
+        """Return the artifact as its record describes it, without a check of its files. Return None if the record
+        cannot be read as one, is a link, or is too large. Raises FileNotFoundError if there is no record."""
         record, root = self.path(stage, key, ".json"), self.path(stage, key)
         if record.is_symlink() or root.is_symlink() or record.stat().st_size > MAX_RECORD_BYTES:
             return None
         try:
             artifact = Artifact.model_validate({"root": root, **json.loads(record.read_bytes())})
-        except (RecursionError, TypeError, ValueError):  # TypeError: JSON, but no object
+        except (RecursionError, TypeError, ValueError):  # TypeError: JSON, but not an object
             return None
         named = all(NAME.fullmatch(name) for name in artifact.inputs)
         return artifact if named and artifact.stage == stage else None
@@ -139,17 +141,17 @@ class Store:
         inputs: Iterable[str] = (),
         checkpoint: str = "",
     ) -> Artifact:
-        """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics, of which those that
-        are finite are kept.
+        """Return the stored artifact, or compute it with `write(folder)`, which returns its metrics. Only finite
+        metrics are kept.
 
         If several callers want the same artifact, one computes it and the others wait. The folder of a resumable stage
-        survives a crash, and the next call resumes in it; any other starts empty. Links that lie in the way are not
-        followed. A store that has the artifact may be read-only. inputs: names of the artifacts that `write` reads;
-        checkpoint: what begins with this name in the folder is no part of the artifact, and stays until that is
-        recorded.
+        survives a crash, and the next call resumes in it; other stages start with an empty one. Links in place of files
+        are not followed. A store that has the artifact may be read-only. inputs: names of the artifacts that `write`
+        reads; checkpoint: files in the folder whose names begin with this are not part of the artifact, and stay until
+        it is recorded.
         """
         if found := self.find(stage, key):
-            if checkpoint:  # of a process that was killed between its commit's last steps
+            if checkpoint:  # left by a process that was killed between the last steps of its commit
                 remove_checkpoint(found.root, checkpoint)
             return found
         partial = self.path(stage, key, ".partial")
@@ -183,15 +185,15 @@ class Store:
         if link.is_symlink() and os.readlink(link) == target:
             return artifact
         link.parent.mkdir(parents=True, exist_ok=True)
-        # What was computed from an earlier artifact, or from none, no longer belongs to the subject.
+        # Results computed from an earlier artifact, or without one, no longer belong to the subject.
         self._unlink_from(subject, STAGES.index(artifact.stage) + 1)
         with atomic_file(link) as beside:
             beside.symlink_to(target)
         return artifact
 
     def unlink_latest(self, subject: str, stages: Iterable[str]) -> None:
-        """Remove a subject's links to artifacts of these stages, which the latest run did without, and to what was
-        computed from them."""
+        """Remove a subject's links to artifacts of these stages, which the latest run skipped, and to what was computed
+        from them."""
         for stage in stages:
             if (self.subject_folder(subject) / stage).is_symlink():
                 self._unlink_from(subject, STAGES.index(stage))
@@ -201,8 +203,8 @@ class Store:
             (self.subject_folder(subject) / stage).unlink(missing_ok=True)
 
     def claim(self, subject: str, digest: str, folder: Path | str) -> None:
-        """Note which recording the results under a subject's name are of; warn if until now they were of another, in
-        another folder: two recordings of one name replace each other's results."""
+        """Note the recording to which the results under a subject's name belong. Warn if they belonged to another
+        recording in another folder until now: two recordings with the same name replace each other's results."""
         path, claimed = self.subject_folder(subject) / RECORDING, f"{digest}\n{folder}\n"
         path.parent.mkdir(parents=True, exist_ok=True)
         before = _text(path)
@@ -215,8 +217,8 @@ class Store:
             replace_text(path, claimed)
 
     def claim_table(self, table: Path, digest: str, folder: Path) -> None:
-        """Note beside a study's table which recording it is of, and make its folder. Raises InputError if there is one
-        of another recording, in another folder, which would be lost."""
+        """Note next to a study's table which recording it belongs to, and create its folder. Raises InputError if there
+        is a table of another recording in another folder, which would be overwritten."""
         note = table.with_suffix(RECORDING)
         if table.exists() and (other := _other_recording(_text(note), digest, folder)):
             raise InputError(
@@ -231,24 +233,24 @@ class Store:
         return self.root / "subjects" / subject
 
     def recording(self, subject: str) -> str:
-        """Return the digest and the folder of a subject's recording, a line each; empty where they are not known."""
+        """Return the digest and the folder of a subject's recording, each on a line; empty if they are not known."""
         return _text(self.subject_folder(subject) / RECORDING)
 
     def path(self, stage: str, key: str, suffix: str = "") -> Path:
-        """Return where an artifact lies, or what belongs to it (.json, .partial, .lock)."""
+        """Return the path of an artifact, or of a file that belongs to it (.json, .partial, .lock)."""
         return self.root / stage / f"{key}{suffix}"
 
     @contextmanager
     def locked(self, stage: str, key: str, wait: bool = True) -> Iterator[None]:
-        """Hold the lock of a key; raise BlockingIOError instead of waiting for it unless `wait`. Where the key has
-        nothing in the end, no lock is left either, nor folders that were made for it."""
+        """Hold the lock of a key. If `wait` is false, raise BlockingIOError instead of waiting for it. If the key has
+        no files in the end, remove the lock, too, and the folders that were created for it."""
         path = self.path(stage, key, ".lock")
         for attempt in count(1):
             with ExitStack() as held:
                 try:
                     held.enter_context(made_folder(path.parent))
                     lock = held.enter_context(open(path, "w", opener=_without_following))
-                except (FileNotFoundError, FileExistsError):  # another removes the folder, which it made, as empty
+                except (FileNotFoundError, FileExistsError):  # another process removes the empty folder that it created
                     if attempt == ATTEMPTS:
                         raise
                     continue
@@ -260,7 +262,7 @@ class Store:
                     log.info("waiting for another process that is working on %s %s", stage, key)
                     fcntl.flock(lock, fcntl.LOCK_EX)
                 if not _is_at(path, lock.fileno()):
-                    continue  # whoever held it has removed it
+                    continue  # the process that held it has removed it
                 try:
                     yield
                 finally:
@@ -270,7 +272,7 @@ class Store:
 
     @contextmanager
     def scratch(self, stage: str, key: str) -> Iterator[Path]:
-        """Make a folder for files on their way in or out, and hold the lock of the key while it is there."""
+        """Create a folder for files on their way in or out, and hold the lock of the key while it exists."""
         with self.locked(stage, key):
             folder = self.path(stage, key, ".moving")
             remove(folder)
@@ -281,8 +283,9 @@ class Store:
                 remove(folder)
 
     def commit(self, artifact: Artifact, checkpoint: str = "") -> Artifact:
-        """Record the files in the artifact's `.partial` folder, and put them in place; its lock must be held. What
-        begins with the name `checkpoint` is deleted last. From here on this process uses the artifact."""
+        """Record the files in the artifact's `.partial` folder, and put them in place; its lock must be held. Files
+        whose names begin with `checkpoint` are deleted last. From now on, the artifact counts as used by this
+        process."""
         pin(self.root, artifact.name)
         stage, key = artifact.stage, artifact.root.name
         partial, folder, record = (self.path(stage, key, suffix) for suffix in (".partial", "", ".json"))
@@ -301,7 +304,7 @@ class Store:
             file.write(artifact.model_dump_json(indent=1, exclude={"root"}))
         _flush(beside)
         remove(folder)
-        # The record comes first: a process that is killed before the folder is in place leaves work that resumes.
+        # The record comes first: if the process is killed before the folder is in place, the work can be resumed.
         os.replace(beside, record)
         os.replace(partial, folder)
         if checkpoint:
@@ -311,14 +314,14 @@ class Store:
 
 
 def remove_checkpoint(folder: Path, name: str) -> None:
-    """Remove what begins with this name from an artifact's folder; nothing where that is read-only."""
+    """Remove the files whose names begin with this from an artifact's folder, unless it is read-only."""
     for path in folder.glob(f"{name}*"):
         with unless_read_only():
             path.unlink(missing_ok=True)
 
 
 def require_intact(subject: Path) -> None:
-    """Raise InputError if an artifact that `<store>/subjects/<name>` links to has changed since it was recorded."""
+    """Raise InputError if an artifact to which `<store>/subjects/<name>` links has changed since it was recorded."""
     for link in sorted(subject.iterdir()):
         root = link.resolve()
         recorded = link.name in STAGES and root.with_name(f"{root.name}.json").is_file()
@@ -327,7 +330,8 @@ def require_intact(subject: Path) -> None:
 
 
 def recording_digest(subject: Path) -> str:
-    """Return the digest of the recording that `<store>/subjects/<name>` was trained on; "" where no record says."""
+    """Return the digest of the recording that `<store>/subjects/<name>` was trained on; "" if there is no record of
+    it."""
     for stage in ("hands", "detection", "capture"):  # the last of them that ran
         root = (subject / stage).resolve()
         if root.is_dir():
@@ -343,7 +347,7 @@ def sha256_of(path: Path) -> str:
 
 
 def remove(folder: Path) -> None:
-    """Remove a folder with all that is in it, or a link in its place, not what that points to."""
+    """Remove a folder with its contents; if a link is in its place, remove the link, not its target."""
     if folder.is_symlink():
         folder.unlink()
     else:
@@ -351,18 +355,19 @@ def remove(folder: Path) -> None:
 
 
 def _text(note: Path) -> str:
-    """Return what a note of the store says; empty where there is none, or a link in its place."""
+    """Return the text of a note in the store; empty if there is none, or if a link is in its place."""
     return note.read_text(errors="replace") if note.is_file() and not note.is_symlink() else ""
 
 
 def _other_recording(note: str, digest: str, folder: Path | str) -> str:
-    """Return the folder that a note names, if it is of a recording of other content in another folder; else nothing."""
+    """Return the folder that a note names if it is about a recording with other content in another folder; else
+    nothing."""
     noted, _, other = note.strip().partition("\n")
     return "" if noted == digest or other == str(folder) else " ".join(other.splitlines())
 
 
 def _is_at(path: Path, descriptor: int) -> bool:
-    """Return whether an open file is the one that lies at a path now."""
+    """Return whether an open file is the one that is now at a path."""
     try:
         return os.path.samestat(os.stat(path, follow_symlinks=False), os.fstat(descriptor))
     except FileNotFoundError:
@@ -370,7 +375,7 @@ def _is_at(path: Path, descriptor: int) -> bool:
 
 
 def _without_following(name: str, flags: int) -> int:
-    """Open a file of the store. Raises InputError if a link lies in its place."""
+    """Open a file of the store. Raises InputError if a link is in its place."""
     try:
         return os.open(name, flags | os.O_NOFOLLOW, 0o666)
     except OSError as error:

@@ -25,7 +25,7 @@ EXTREME_POSES = 3  # checked for each strength and seed
 
 @stage("study-capture", version="5")
 def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) -> dict[str, float]:
-    """Write a degraded capture, in the form that `ingest` writes."""
+    """Write a degraded capture in the format that `ingest` writes."""
     degradation.apply(Capture.load(recording.root), out=out)
     return {}
 
@@ -34,7 +34,8 @@ def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) ->
 def degrade_clothing(
     out: Path, truth: Source, recording: Artifact, calibration: Artifact, body: Artifact, degradation: Degradation
 ) -> dict[str, float]:
-    """Write a capture whose person wears added clothes or hair, and its ground truth likewise under `ground_truth/`."""
+    """Write a capture whose person wears added clothes or hair, and its ground truth with them under
+    `ground_truth/`."""
     capture = calibrated_capture(recording, calibration)
     degradation.apply(capture, BodyFit.load(body.root), GroundTruth(truth.root, capture), out=out)
     require_unchanged(truth)

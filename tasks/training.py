@@ -24,7 +24,7 @@ def train(
     body: Artifact,
     settings: TrainingSettings,
 ) -> dict[str, float]:
-    """Train on one GPU a process; resume from the checkpoint of an interrupted run."""
+    """Train with one process per GPU; resume from the checkpoint of an interrupted run."""
     inputs = [str(artifact.root) for artifact in (recording, calibration, segmentation, body)]
     gpus = torch.cuda.device_count()
     if 0 < gpus < settings.processes:

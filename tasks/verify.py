@@ -1,4 +1,4 @@
-"""Whether a store holds what its records say."""
+"""Check of whether a store holds what its records say."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -12,7 +12,7 @@ from tasks.store import Artifact, Store
 
 @dataclass(frozen=True)
 class Checked:
-    """What was checked, and one line for each fault."""
+    """What was checked, and one line per fault."""
 
     artifacts: int
     files: int
@@ -21,8 +21,9 @@ class Checked:
 
 
 def faults(store: Store, subjects: Iterable[str] = ()) -> Checked:
-    """Check the digests of all artifacts, or of those of some subjects, that no file lies beside the recorded ones, and
-    that links lead somewhere. Raises InputError for an unknown subject. What is being computed is not looked at."""
+    """Check the digests of all artifacts, or of those of some subjects, that there are no unrecorded files next to the
+    recorded ones, and that links lead somewhere. Unfinished work is not checked. Raises InputError for an unknown
+    subject."""
     inventory = Inventory.of(store)
     chosen = list(inventory.stored.values())
     links = inventory.latest
