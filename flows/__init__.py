@@ -1,4 +1,4 @@
-"""Prefect flows and the command line: only the order in which stages run."""
+"""Prefect flows and the command line. They only define the order in which stages run."""
 
 import os
 

@@ -1,7 +1,7 @@
 """Ablations: a training and an evaluation for every file in `configs/ablations/`.
 
-A file holds the settings in which its row differs from the preset. Through the store, stages whose settings it leaves
-alone are shared by all rows, and finished rows are reused.
+A file holds the settings in which its row differs from the preset. The store lets all rows share the stages whose
+settings they do not change, and reuses finished rows.
 """
 
 import json
@@ -44,11 +44,11 @@ def ablate(
     overrides: Sequence[str] = (),
     only: Sequence[str] = (),
 ) -> Path:
-    """Run the full method and each ablation; return the table, `<store>/ablations/<subject>-<preset>.md`, which has a
-    JSON file beside it. Both are rewritten after every row.
+    """Run the full method and each ablation; return the table, `<store>/ablations/<subject>-<preset>.md`. There is a
+    JSON file next to it; both are rewritten after every row.
 
-    A row whose training or evaluation fails says why and the rest go on; a worker that was killed (LostWorkerError)
-    ends the command, and the same command resumes.
+    If a row's training or evaluation fails, the row says why and the others continue. A worker that was killed
+    (LostWorkerError) ends the command, and the same command resumes.
 
     Args:
         capture: The recording's folder, or one video; relative to the repository.
@@ -76,7 +76,7 @@ def ablate(
 
 
 def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], dict[str, str]]:
-    """Return the settings of each row, the full method first, and why the other ablations have none."""
+    """Return the settings of each row, the full method first, and why other ablations have no row."""
     known = {path.stem: path for path in sorted(ABLATIONS.glob("*.yaml"))}
     unknown = sorted(set(only) - set(known))
     if unknown:
@@ -94,13 +94,14 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
 
 
 def measure(store: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
-    """Return a row: scores of every split, seconds and device of its training; {"error": one line} if one fails."""
+    """Return a row: the scores of every split, and the seconds and device of its training; {"error": one line} if it
+    fails."""
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     prepared = prepare_training(store, recording, settings)
     try:
         training = train(store, *prepared, settings.training)
         evaluation = evaluate(store, truth, *prepared, training, settings.evaluation)
-    except Exception as error:  # that a method breaks without a part is a result
+    except Exception as error:  # it is a result that a method breaks without a part
         if is_of_the_machine(error):
             raise
         log.warning("%s: %s", type(error).__name__, error)
@@ -113,7 +114,7 @@ def measure(store: Store, source: Source, truth: Source, settings: Settings) -> 
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """Format a row for each run, then the ablations that were left out, then the protocol."""
+    """Format one row per run, then the ablations that were left out, then the protocol."""
     with_overrides = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
     titles = ["", *(title for title, _ in COLUMNS.values()), "training, s", "on"]
     lines = [f"# Ablations of {result['subject']}, preset `{result['preset']}`{with_overrides}", ""]

@@ -25,15 +25,15 @@ from flows.ingest_captures import DISK_EVENT
 SILENCE_S = 150  # five heartbeats of prefect.toml
 MIN_SILENCE_S = 60
 BLOCK = "hnerf-operator"
-# Whatever event of a run ends the wait for a sign of life, so that all those before its heartbeats must begin it anew.
+# Any event of a run ends the wait for a sign of life, so every event before its heartbeats must start the wait again.
 STARTING = ("Pending", "Submitting", "InfrastructurePending", "pull-step.executed")
 SIGNS_OF_LIFE = {f"prefect.flow-run.{sign}" for sign in ("heartbeat", *STARTING)}
 RUNS = {"prefect.resource.id": "prefect.flow-run.*"}
 
 
 def lost_runs(silence_s: int) -> AutomationCore:
-    """Return the automation that ends runs without a sign of life, whose process and worker were lost together, at work
-    or while the worker began them; `ingest-captures` then begins them again."""
+    """Return the automation that ends runs that give no sign of life. Their process and worker were lost together, at
+    work or while the worker started them; `ingest-captures` then starts them again."""
     message = f"no sign of life for {silence_s} s: its process or its machine was lost"
     return AutomationCore(
         name="hnerf: lost runs",
@@ -83,7 +83,7 @@ def _notice(name: str, what: str, match: dict[str, Any], expect: set[str], text:
 
 
 def set_up(webhook: str | None, pool: str, silence_s: int) -> list[str]:
-    """Make the automations, or bring those of the same names up to date; return the names."""
+    """Create the automations, or update those with the same names; return the names."""
     wanted = [lost_runs(silence_s)]
     if webhook:
         headers = SecretDict({"Content-Type": "application/json"})
@@ -100,7 +100,7 @@ def set_up(webhook: str | None, pool: str, silence_s: int) -> list[str]:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Set up what the command line says."""
+    """Set up what the command line requests."""
     parser = argparse.ArgumentParser(prog="python -m flows.automations", description=__doc__)
     parser.add_argument("--webhook", metavar="URL", help="called, with a line of text, when the operator is needed")
     parser.add_argument("--pool", default="local", help="whose workers are watched (default: local)")
@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> None:
     options = parser.parse_args(argv)
     if options.silence < MIN_SILENCE_S:
         parser.exit(2, f"--silence {options.silence}: healthy runs would be ended; give {MIN_SILENCE_S} or more\n")
-    if not PREFECT_API_URL.value():  # Prefect would begin a server of its own, which ends with this command
+    if not PREFECT_API_URL.value():  # Prefect would start its own server, which ends with this command
         parser.exit(2, "no server is set; give this command in the folder of prefect.toml, or set PREFECT_API_URL\n")
     try:
         print("\n".join(set_up(options.webhook, options.pool, options.silence)))

@@ -1,4 +1,4 @@
-"""Benchmark flow: methods trained on the same data, scored while they train, timed, and charted."""
+"""Benchmark flow: methods trained on the same data, scored during training, timed, and charted."""
 
 import json
 import logging
@@ -39,17 +39,17 @@ def benchmark(
     seconds: Annotated[float, Field(gt=0)] | None = None,
     store: Path = Path("store"),
 ) -> Path:
-    """Train and score every method of a study on every variant; return `<store>/benchmark/<subject>-<study>.md`, which
-    has CSV, JSON and charts beside it, all rewritten after every training.
+    """Train and score every method of a study on every variant; return `<store>/benchmark/<subject>-<study>.md`. CSV,
+    JSON and charts are next to it; all are rewritten after every training.
 
-    A method that fails says why and the rest go on; a worker that was killed ends the flow, and the same call resumes
-    the training that was interrupted.
+    If a method fails, its row says why and the others continue. A worker that was killed ends the flow, and the same
+    call resumes the training that was interrupted.
 
     Args:
         capture: The recording's folder, or one video; relative to the repository.
         study: A name under configs/benchmark/, or a YAML file.
-        methods: Of the study, or presets, instead of all; the table's name then ends in "-part".
-        seconds: Limit of every training, instead of the study's; likewise.
+        methods: Methods of the study, or presets, instead of all; the table's name then ends in "-part".
+        seconds: Time limit of every training, instead of the study's; the table's name then ends in "-part".
         store: Folder of results.
     """
     whole = load_study(study)
@@ -72,14 +72,14 @@ def benchmark(
         for name in () if "left_out" in entry else variant.methods or plan.methods:
             log.info("%s: %s", title, name)
             entry["methods"][name] = measure(artifact_store, source, truth, variant, plan, name)
-            table = publish(result, artifact_store.root)  # an earlier call's files stand until the first result
+            table = publish(result, artifact_store.root)  # an earlier call's files stay until the first result
     table = table or publish(result, artifact_store.root)  # if every variant is left out
     publish_markdown(embed_images(table), "benchmark", f"Speed against accuracy: {table.stem}")
     return table
 
 
 def empty_result(plan: BenchmarkStudy, study: str, part: bool, recorded: Capture) -> dict[str, Any]:
-    """Return a result without scores, in the form of hnerf/study/benchmark/results.py."""
+    """Return a result without scores, in the format of hnerf/study/benchmark/results.py."""
     described = plan.model_dump(include={"title", "notes", "claims", "seconds", "until_flat", "sweep", "methods"})
     variants = {title: describe_variant(variant, recorded) for title, variant in plan.variants.items()}
     named = {"subject": recorded.name, "study": study, "part": part}
@@ -87,7 +87,7 @@ def empty_result(plan: BenchmarkStudy, study: str, part: bool, recorded: Capture
 
 
 def describe_variant(variant: Variant, recorded: Capture) -> dict[str, Any]:
-    """Return how many cameras and frames a variant trains on, or why it is left out if the capture has too few."""
+    """Return how many cameras and frames a variant trains on, or, if the capture has too few, why it is left out."""
     try:
         cameras, frames, _ = variant.select(recorded)
     except InputError as error:
@@ -97,8 +97,8 @@ def describe_variant(variant: Variant, recorded: Capture) -> dict[str, Any]:
 
 
 def ingest_part(store: Store, source: Source, part: CapturePart, settings: Settings) -> Artifact:
-    """Ingest the recording, or that part of it which a study uses, within the limits of these settings, which then
-    apply to what follows."""
+    """Ingest the recording, or the part of it that a study uses. The limits of these settings apply here and
+    afterwards."""
     set_limits(settings.limits)
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     parts = part.select(Capture.load(recording.root))
@@ -108,7 +108,7 @@ def ingest_part(store: Store, source: Source, part: CapturePart, settings: Setti
 def measure(
     store: Store, source: Source, truth: Source, variant: Variant, plan: BenchmarkStudy, method: str
 ) -> dict[str, Any]:
-    """Return a method's scores on a variant, and the folder of their files in the store; {"error": one line} if it
+    """Return a method's scores on a variant and the folder of their files in the store; {"error": one line} if it
     fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
@@ -132,9 +132,9 @@ def measure(
 def train_until_flat(
     store: Store, truth: Source, prepared: Prepared, plan: BenchmarkStudy, method: str
 ) -> tuple[Settings, dict[str, Any]]:
-    """Train for longer and longer; return the settings of the last training, and the curve of all and why there are no
-    longer ones. A training that fails has no point, as it may be too young for a surface; if the longest does, its
-    error is raised."""
+    """Train for longer and longer. Return the settings of the last training, the curve of all trainings, and why there
+    is no longer one. A training that fails adds no point, since it may be too short for a surface; if the longest
+    fails, its error is raised."""
     assert plan.seconds is not None
     recording, calibration, _, body = prepared
     points: list[dict[str, Any]] = []
@@ -145,7 +145,7 @@ def train_until_flat(
             training = train(store, *prepared, settings.training)
             point = score_end_of_training(store, truth, recording, calibration, body, training, plan.scoring)
         except Exception as error:
-            if is_of_the_machine(error) or limit_s == limits_s[-1]:  # which would only be trained again
+            if is_of_the_machine(error) or limit_s == limits_s[-1]:  # the longest would only be trained again
                 raise
             log.warning("after %g s: %s", limit_s, one_line(error))
             continue

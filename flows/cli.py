@@ -1,4 +1,4 @@
-"""The command line: the flows' work from a shell, without a server."""
+"""The command line: runs the flows' work from a shell, without a server."""
 
 import argparse
 import errno
@@ -20,19 +20,19 @@ from tasks.limits import StalledError
 from tasks.source import place
 from tasks.store import NAME, Store
 
-FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143  # the last two as shells have them
-NO_ROOM = (None, *DISK_FULL, errno.EFBIG)  # None: our own, of libraries that do not say why
-CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # of hnerf.capture.formats.export, which is slow
-PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # of hnerf.render.subject, which imports torch
-SIZES_PX = (2, 8000)  # of a picture's side, of the same module
-ORBIT_PICTURES = 60  # of the same module
-STATURE_M = (0.5, 2.3)  # of hnerf.calibration.diagnosis, which imports numpy
-MAX_COUNT, MAX_M = 999_999, 1000  # pictures have names of six digits
+FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143  # the last two as in shells
+NO_ROOM = (None, *DISK_FULL, errno.EFBIG)  # None: our own errors, for libraries that do not say why
+CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # as in hnerf.capture.formats.export
+PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # as in hnerf.render.subject, which imports torch
+SIZES_PX = (2, 8000)  # of an image's side, as in the same module
+ORBIT_PICTURES = 60  # as in the same module
+STATURE_M = (0.5, 2.3)  # as in hnerf.calibration.diagnosis, which imports numpy
+MAX_COUNT, MAX_M = 999_999, 1000  # image names have six digits
 FOLDERS = {
     "capture": "the capture folder, or one video",
     "folder": "the capture folder",
     "subject": "<store>/subjects/<name> of a finished `hnerf run`",
-}  # among a command's options, and what they are
+}  # options of commands that are folders, and what each is
 
 MOTIONS = "a BVH file, an AMASS .npz, or another subject's folder"
 
@@ -41,9 +41,9 @@ log = logging.getLogger("hnerf")
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; one line on stderr and 2 for input and paths that cannot be used, 1 for a training that cannot
-    go on, an asset that must not be handed over, or output that nobody reads; 130 if it is interrupted from the
-    keyboard, 143 by SIGTERM."""
+    """Run one command; return its exit code. Errors are one line on stderr. The code is 2 for input and paths that
+    cannot be used; 1 for a training that cannot continue, an asset that must not be delivered, or output that nobody
+    reads; 130 if interrupted from the keyboard; 143 after SIGTERM."""
     open_closed_streams()
     try:
         return _run(argv)
@@ -90,7 +90,7 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     try:
         return _parser().parse_args(argv)
     finally:
-        sys.stdout.flush()  # the help, after which argparse ends the process
+        sys.stdout.flush()  # prints the help, after which argparse ends the process
 
 
 def _fail(why: object, status: int) -> int:
@@ -107,7 +107,7 @@ def _reader_has_left() -> bool:
 
 
 def _existing(options: argparse.Namespace) -> list[Path]:
-    """Return the folders that a command reads; InputError for what is wrong without the imports that take seconds."""
+    """Return the folders that a command reads. Raises InputError for faults that can be found without slow imports."""
     if "preset" in options:
         load_settings(options.preset, getattr(options, "overrides", ()))
     folders = {what: given for name, what in FOLDERS.items() if isinstance(given := getattr(options, name, None), Path)}
@@ -131,14 +131,14 @@ def _existing(options: argparse.Namespace) -> list[Path]:
 
 
 def _require_outside_artifacts(out: Path) -> None:
-    """Raise InputError where something new would lie in an artifact of a store, among the files of its record."""
+    """Raise InputError if new output would lie in an artifact of a store, among its recorded files."""
     for folder in out.resolve().parents:
         if NAME.fullmatch(f"{folder.parent.name}/{folder.name}") and folder.with_name(f"{folder.name}.json").is_file():
             raise InputError(f"{out}: lies in the results of a run, which would count as damaged; give another")
 
 
 def _recording(options: argparse.Namespace) -> Path | None:
-    """Return the recording that a command reads, or has results of; None where that is not known."""
+    """Return the recording that a command reads or whose results it reads; None if it is not known."""
     if options.command is commands.export_cameras:
         return options.folder.resolve()
     if "name" in options:
@@ -167,7 +167,7 @@ def _parser() -> argparse.ArgumentParser:
     preset.add_argument("--preset", default="fast", help="preset of configs/, or a YAML file (default: fast)")
 
     def add(command: Command, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
-        """Add a command that has its function's name, and its docstring as help."""
+        """Add a command named after its function, with the docstring as help."""
         what = command.__doc__
         added = subparsers.add_parser(_name(command), help=what, description=what, parents=parents)
         added.set_defaults(command=command)
@@ -288,7 +288,7 @@ def _names(text: str) -> list[str]:
 
 
 def _number(kind: type[float], low: float, high: float) -> Callable[[str], float]:
-    """Return the type of an option that takes such numbers, int or float; others are refused, NaN included."""
+    """Return an option type that takes numbers in a range, int or float, and refuses others, including NaN."""
 
     def read(text: str) -> float:
         with suppress(ValueError):

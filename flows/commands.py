@@ -1,6 +1,6 @@
-"""What each command does with its options; its docstring is its help.
+"""The work of each command, by its options. A function's docstring is the help of its command.
 
-Each imports what it needs itself, so that the others, and help, need not wait for torch and Prefect.
+Each function imports what it needs, so that the others, and help, need not wait for torch and Prefect.
 """
 
 import argparse
@@ -85,7 +85,7 @@ def check_cameras(options: argparse.Namespace) -> None:
 
 
 def _table(report: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a calibration report for people."""
+    """Yield a calibration report as lines for people."""
     yield f"{'camera':<12} {'status':<9} {'median px':>9} {'95 % px':>9}  remarks"
     for name, camera in report["cameras"].items():
         median, p95 = ("-" if px is None else f"{px:.2f}" for px in (camera["median_px"], camera["p95_px"]))
@@ -139,7 +139,7 @@ def _calibrate_from_person(options: argparse.Namespace, out: Path) -> None:
 
 
 def _is_pose2sim(folder: Path) -> bool:
-    """Return whether a recording is read in the layout of Pose2Sim, once it has a calibration of that layout."""
+    """Return whether a recording is read in Pose2Sim's layout once it has a calibration in that layout."""
     return (folder / "pose").is_dir() and not (folder / "extri.yml").exists()
 
 
@@ -183,7 +183,7 @@ def _export_cameras(options: argparse.Namespace, out: Path) -> None:
 
 
 def _read_in_cage(read: Callable[[argparse.Namespace, Path], None], options: argparse.Namespace, out: Path) -> None:
-    """Call `read(options, out)` in a process of its own, with the limits that the options set."""
+    """Call `read(options, out)` in a separate process, with the limits that the options set."""
     from tasks.cage import run_caged
     from tasks.limits import set_limits
 
@@ -193,7 +193,7 @@ def _read_in_cage(read: Callable[[argparse.Namespace, Path], None], options: arg
 
 
 def _check_section(options: argparse.Namespace, section: str) -> None:
-    """Raise InputError for a setting of another section."""
+    """Raise InputError for settings of other sections."""
     for override in options.overrides:
         if override.partition("=")[0].split(".")[0] != section:
             raise InputError(

@@ -1,4 +1,4 @@
-"""What a command shows while it works: the library's log on standard output, with bars of progress on a terminal."""
+"""What a command shows while it works: the library's log on standard output, with progress bars on a terminal."""
 
 import logging
 import sys
@@ -10,7 +10,7 @@ from hnerf.progress import Progress, log
 
 @contextmanager
 def display() -> Iterator[None]:
-    """Show the log, in place of Prefect's console handler, which writes to standard error."""
+    """Show the log instead of using Prefect's console handler, which writes to standard error."""
     logger, level = logging.getLogger("hnerf"), log.level
     handler = TerminalHandler() if sys.stdout.isatty() else LineHandler(sys.stdout)
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
@@ -29,19 +29,19 @@ def display() -> Iterator[None]:
 
 
 class LineHandler(logging.StreamHandler):
-    """Prints records, unless nobody reads them any more, or they have no room."""
+    """Prints records; ignores it if nobody reads them any more or the disk is full."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Say nothing of a closed pipe or a full disk, which the command notices at its end."""
+        """Ignore a closed pipe or a full disk, which the command notices at its end."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handleError(record)
 
 
 class TerminalHandler(logging.Handler):
-    """Draws a bar with the time left for each work in progress, and prints all other records above the bars."""
+    """Draws a bar with the remaining time for each work in progress, and prints all other records above the bars."""
 
     def __init__(self) -> None:
-        from rich import progress  # not where nothing is drawn
+        from rich import progress  # imported only if something is drawn
 
         super().__init__()
         columns = progress.TextColumn("{task.description}"), progress.BarColumn(), progress.TaskProgressColumn()
@@ -61,9 +61,9 @@ class TerminalHandler(logging.Handler):
         elif at.what in self.shown:
             self.bars.remove_task(self.shown.pop(at.what))
             if not self.shown:
-                self.bars.stop()  # what is printed from here on is not folded to the terminal's width
+                self.bars.stop()  # later output is then not wrapped to the terminal's width
 
     def close(self) -> None:
-        """Take the bars away."""
+        """Remove the bars."""
         self.bars.stop()
         super().close()

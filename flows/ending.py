@@ -1,4 +1,5 @@
-"""How a command ends that is told to, and what it does with streams that were closed before it began."""
+"""How a command ends on a signal, and how it handles streams that were closed before it started or cannot be
+written."""
 
 import fcntl
 import os
@@ -9,18 +10,18 @@ from contextlib import contextmanager
 from threading import Timer
 from types import FrameType
 
-SEND_AGAIN_S = 0.1  # by when Python has left what drops exceptions
+SEND_AGAIN_S = 0.1  # by then, Python has left the code that drops exceptions
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, which unwinds a command as Ctrl-C does."""
+    """SIGTERM as an exception, which unwinds a command as Ctrl-C does."""
 
 
 @contextmanager
 def unwound_by_sigterm() -> Iterator[None]:
-    """Raise Terminated in the code inside on the first SIGTERM; ignore others, which timeout(1) sends while files are
-    removed. The processes that a command starts have the default again. Neither this nor Ctrl-C is lost where Python
-    drops exceptions, as in a callback of a weak reference: it comes once more."""
+    """Raise Terminated in the code inside on the first SIGTERM. Ignore further ones, which timeout(1) sends while files
+    are being removed. Processes that a command starts have the default handler again. If Python drops this exception or
+    that of Ctrl-C, as in a weak reference's callback, the signal is sent once more."""
     before, hook = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
     sys.unraisablehook = lambda dropped: _send_again(dropped.exc_value) or hook(dropped)
     try:
@@ -36,7 +37,8 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _send_again(dropped: BaseException | None) -> bool:
-    """Send this process the signal once more, in a moment, whose exception was dropped; return whether it was one."""
+    """If the dropped exception came from a signal, send this process that signal once more in a moment; return whether
+    it did."""
     if not isinstance(dropped, KeyboardInterrupt):
         return False
     number = signal.SIGINT
@@ -44,15 +46,15 @@ def _send_again(dropped: BaseException | None) -> bool:
         number = signal.SIGTERM
         signal.signal(number, _terminate)
     timer = Timer(SEND_AGAIN_S, os.kill, (os.getpid(), number))
-    timer.daemon = True  # who has ended by then needs none
+    timer.daemon = True  # a process that has ended by then needs no signal
     timer.start()
     return True
 
 
 def open_closed_streams() -> None:
-    """Let standard output and error that are closed (`>&-`), or open for reading alone, go nowhere: of closed ones,
-    Python has None in their place, and the next file that is opened would have their number, into which libraries
-    write."""
+    """Redirect standard output and error to /dev/null if they are closed (`>&-`) or open only for reading. For a closed
+    one, Python has None in its place. The next file that is opened would get its number, and libraries would write into
+    it."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None or fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
@@ -61,8 +63,8 @@ def open_closed_streams() -> None:
 
 
 def drop_what_is_left() -> None:
-    """Drop what standard output and error do not take, as their disk is full or nobody reads them: Python would print a
-    trace about it at its end, and change the exit code."""
+    """Drop output that standard output and error do not take because the disk is full or nobody reads it. Otherwise,
+    Python would print a traceback about it at exit and change the exit code."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

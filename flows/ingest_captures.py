@@ -1,4 +1,4 @@
-"""Watch a folder, and train every capture that appears in it once."""
+"""Watch a folder, and train once on every capture that appears in it."""
 
 import hashlib
 import logging
@@ -24,7 +24,7 @@ from tasks.ledger import Ledger
 from tasks.remote import remote_captures
 from tasks.source import entries, place, read_capture
 
-DISK_EVENT = "hnerf.disk.nearly-full"  # flows/automations.py tells the operator
+DISK_EVENT = "hnerf.disk.nearly-full"  # flows/automations.py notifies the operator
 
 log = logging.getLogger("hnerf.ingest_captures")
 
@@ -69,7 +69,7 @@ def ingest_captures(
     room: int | None = None
     for capture, listing in _unseen(folder, ledger, settle_s):
         room = max_unfinished - unfinished_runs() if room is None else room
-        if len(started) >= room:  # before the capture is read, which every look would do again
+        if len(started) >= room:  # before the capture is read, or every look would read it again
             log.info("%s and what follows wait: %d runs have not ended", capture, max_unfinished)
             break
         digest = _digest(capture, listing)
@@ -90,7 +90,7 @@ def ingest_captures(
 
 
 def _has_room(store: Path, min_free_gib: float) -> bool:
-    """Return whether the store's disk has enough free space; say so, also to the server, if not."""
+    """Return whether the store's disk has enough free space; if not, log it and notify the server."""
     free_gib = shutil.disk_usage(store).free / 2**30
     if free_gib >= min_free_gib:
         return True
@@ -103,8 +103,8 @@ def _has_room(store: Path, min_free_gib: float) -> bool:
 
 
 def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tuple[Path | str, str]]:
-    """Yield the captures of a folder that are complete and were not seen before, with the digests of their listing;
-    note why one cannot be read."""
+    """Yield the captures of a folder that are complete and were not seen before, with the digests of their listings.
+    For a capture that cannot be read, note why."""
     if isinstance(folder, str):
         yield from _unseen_in_bucket(folder, ledger, settle_s)
         return
@@ -120,7 +120,7 @@ def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tup
 
 
 def _unseen_in_bucket(folder: str, ledger: Ledger, settle_s: float) -> Iterator[tuple[str, str]]:
-    """Yield the same of captures in a bucket."""
+    """Yield the complete and unseen captures in a bucket, with the digests of their listings."""
     for capture in remote_captures(folder):
         listing = f"seen-{capture.digest}"
         if not ledger.seen(listing) and ledger.stood_s(listing) >= settle_s:
@@ -128,8 +128,8 @@ def _unseen_in_bucket(folder: str, ledger: Ledger, settle_s: float) -> Iterator[
 
 
 def _digest(capture: Path | str, listing: str) -> str | None:
-    """Return the digest of a capture's content, for which its listing stands in a bucket; None, with a note, if it
-    cannot be read."""
+    """Return the digest of a capture's content; in a bucket, the listing takes its place. Return None, and note why, if
+    the capture cannot be read."""
     if isinstance(capture, str):
         return listing.removeprefix("seen-")
     try:
@@ -142,12 +142,12 @@ def _digest(capture: Path | str, listing: str) -> str | None:
 def _refuse(capture: Path, error: Exception) -> None:
     """Note why a capture cannot be read."""
     log.error("%s", error)
-    with suppress(OSError):  # a folder that may only be read
+    with suppress(OSError):  # a read-only folder
         quarantine.note(capture, f"refused: {error}")
 
 
 def _captures(folder: Path) -> Iterator[Path]:
-    """Yield the subfolders, sorted, without hidden ones and links, which may lead anywhere."""
+    """Yield the subfolders, sorted, without hidden ones and without links, which may lead anywhere."""
     for path in sorted(folder.iterdir()):
         if path.name.startswith(".") or not path.is_dir():
             continue
@@ -158,9 +158,10 @@ def _captures(folder: Path) -> Iterator[Path]:
 
 
 def _listing(capture: Path) -> tuple[str, float]:
-    """Return a digest of the names, sizes and times of a folder's files, which tells whether it was seen before without
-    reading them, and when one was last written, moved or made (0 if there is none): modification times alone may be
-    those of the original. A hidden file, such as a copy under way, only counts for when."""
+    """Return a digest of the names, sizes and times of a folder's files, and when one was last written, moved or
+    created (0 if there is none). The digest tells whether the folder was seen before without reading the files. The
+    time is the change time, since a copy may keep the original's modification time. A hidden file, such as a copy in
+    progress, counts only for the time."""
     listing, touched_s, files = hashlib.sha256(), 0.0, 0
     for entry in sorted(entries(capture, hidden=True), key=lambda entry: entry.path):
         stat = entry.stat(follow_symlinks=False)

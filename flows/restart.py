@@ -1,4 +1,4 @@
-"""Runs of the training deployment: how many have not ended, and those to take up again that crashed."""
+"""Runs of the training deployment: the number that have not ended, and restarts of those that crashed."""
 
 import logging
 from datetime import UTC, datetime, timedelta
@@ -16,10 +16,10 @@ DEPLOYMENT = f"{FLOW}/{NAME}"
 UNFINISHED = (StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED, StateType.CANCELLING)
 
 AGAIN = "crashed; begun again"
-# A worker with a limit ends when it is offered a run that it has not let go of, and until then it imports the flow once
-# more, for its hooks: a minute on a busy machine.
+# A worker with a limit ends if it is offered a run that it has not released yet. Before it releases one, it imports the
+# flow once more, for its hooks, which takes a minute on a busy machine.
 RELEASE = timedelta(minutes=2)
-PAGE = 100  # runs; the server gives at most 200 at once
+PAGE = 100  # runs per request; the server returns at most 200
 
 log = logging.getLogger("hnerf.restart")
 
@@ -31,10 +31,9 @@ def unfinished_runs() -> int:
 
 
 def restart_crashed(max_restarts: int) -> list[tuple[FlowRun, str]]:
-    """Put crashed runs of the deployment, those whose machine or process was lost, back into the queue. Each is begun
-    no more than `max_restarts` times again, because the run itself may be what ends the process, even before the server
-    counts it as running. It begins after RELEASE. If it crashes once more, it becomes failed: return these runs, with
-    the reason."""
+    """Put crashed runs of the deployment, whose machine or process was lost, back into the queue, to start after
+    RELEASE. Each is restarted at most `max_restarts` times, because the run itself may be what ends the process, even
+    before the server counts it as running. Runs that crash once more become failed; return these, with the reason."""
     given_up = []
     with get_client(sync_client=True) as client:
         for run in _all_runs(client, StateType.CRASHED):
@@ -53,7 +52,7 @@ def restart_crashed(max_restarts: int) -> list[tuple[FlowRun, str]]:
 
 
 def _all_runs(client: SyncPrefectClient, *states: StateType) -> list[FlowRun]:
-    """Return all runs of the deployment in these states, oldest first; the server answers with some at a time."""
+    """Return all runs of the deployment in these states, oldest first; the server returns them in pages."""
     found: list[FlowRun] = []
     while some := client.read_flow_runs(
         **_filters(*states), sort=FlowRunSort.EXPECTED_START_TIME_ASC, limit=PAGE, offset=len(found)

@@ -1,4 +1,4 @@
-"""The page of a flow run: texts, pictures, links, and how far long work has come."""
+"""The page of a flow run: texts, images, links, and the progress of long work."""
 
 import logging
 import re
@@ -21,26 +21,26 @@ from hnerf.capture.safe_io import read_image
 from hnerf.evaluation.pictures import data_uri, shrunk
 from hnerf.progress import Progress, listening
 
-UPDATE_S = 10.0  # between two updates of one work's progress
-PICTURE_PX = 640  # longest side on the page; the server keeps its bytes in the database
+UPDATE_S = 10.0  # between updates of the progress of one piece of work
+PICTURE_PX = 640  # longest side on the page; the server stores the bytes in its database
 
 log = logging.getLogger("hnerf.run_page")
 
 
 def publish_markdown(markdown: str, key: str, description: str) -> None:
-    """Publish a text, with its pictures embedded, on the page of the flow run; do nothing outside a run."""
+    """Publish a text, with its images embedded, on the page of the flow run; do nothing outside a run."""
     if FlowRunContext.get():
         create_markdown_artifact(markdown, key=key, description=description)
 
 
 def publish_link(path: Path, key: str, description: str) -> None:
-    """Publish a link to a file of this machine; do nothing outside a run."""
+    """Publish a link to a file on this machine; do nothing outside a run."""
     if FlowRunContext.get():
         create_link_artifact(path.as_uri(), link_text=str(path), key=key, description=description)
 
 
 def embedded(pictures: Sequence[tuple[str, Path]]) -> str:
-    """Return Markdown that shows captioned image files, shrunk."""
+    """Return Markdown that shows captioned image files, scaled down."""
     return "\n\n".join(
         f"{caption}\n\n![{caption}]({data_uri(shrunk(read_image(path), PICTURE_PX))})" for caption, path in pictures
     )
@@ -48,7 +48,7 @@ def embedded(pictures: Sequence[tuple[str, Path]]) -> str:
 
 @contextmanager
 def shown_progress() -> Iterator[None]:
-    """Show on the page of the flow run how far each work has come that is reported inside and takes a while."""
+    """Show on the page of the flow run the progress of all long work that is reported inside."""
     if not FlowRunContext.get():
         yield
         return
@@ -64,7 +64,7 @@ class _ProgressPage:
         self.next_s: dict[str, float] = {}
 
     def show(self, progress: Progress) -> None:
-        """Show a report; one that cannot be shown ends no work."""
+        """Show a progress report; if it cannot be shown, the work continues."""
         key, now = slug(progress.what), time.monotonic()
         ended = progress.done >= progress.total
         due = now >= self.next_s.setdefault(key, now + UPDATE_S)
@@ -84,5 +84,5 @@ class _ProgressPage:
 
 
 def slug(text: str) -> str:
-    """Return a text as the key of an artifact: lower-case letters, digits and dashes."""
+    """Convert a text to an artifact key: lower-case letters, digits and dashes."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "work"

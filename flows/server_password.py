@@ -2,7 +2,7 @@
 
 import secrets
 
-NAMES = ("PREFECT_SERVER_API_AUTH_STRING", "PREFECT_API_AUTH_STRING")  # the server's, and everybody else's
+NAMES = ("PREFECT_SERVER_API_AUTH_STRING", "PREFECT_API_AUTH_STRING")  # the server's, and everyone else's
 
 
 def environment() -> str:

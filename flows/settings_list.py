@@ -1,4 +1,4 @@
-"""Settings as a list for people: what --set takes, its type, and the comment beside it in hnerf/config.py."""
+"""Settings as a list for people: what --set takes, its type, and the comment next to it in hnerf/config.py."""
 
 import inspect
 import json
@@ -16,8 +16,8 @@ FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
 
 
 def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Iterator[str]:
-    """Yield a line for each setting, `key=value  type  description`, those of nested sections under their own keys.
-    kinds: which there are, of a section that is of one kind of several."""
+    """Yield a line for each setting, `key=value  type  description`; settings of nested sections have their section's
+    key as prefix. kinds: the available kinds, for a section that can be one of several."""
     about = dict(FIELD.findall("\n".join(inspect.getsource(kind) for kind in _sections(type(settings)))))
     for name, field in type(settings).model_fields.items():
         value = getattr(settings, name)
@@ -31,7 +31,7 @@ def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Itera
 
 
 def _sections(kind: type[Section]) -> list[type]:
-    """Return the class and its bases that may have settings, the bases first."""
+    """Return the class and its bases that may have settings, bases first."""
     return [base for base in reversed(kind.__mro__) if issubclass(base, Section)]
 
 
@@ -42,7 +42,7 @@ def _type(field: FieldInfo) -> str:
 
 
 def _name(annotation: Any) -> str:
-    """Return a type's name as people read it."""
+    """Return a type's name in a form for people."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _name(arguments[0])

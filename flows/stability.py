@@ -57,18 +57,18 @@ def stability(
     only: Sequence[str] = (),
 ) -> Path:
     """Run each method on a capture degraded in every way that a study names; return the table,
-    `<store>/stability/<subject>-<study>.md`, which has JSON beside it, both rewritten after every run, and charts,
-    drawn when the flow ends, even by an error.
+    `<store>/stability/<subject>-<study>.md`. It and the JSON next to it are rewritten after every run; charts are drawn
+    when the flow ends, even if by an error.
 
-    A failure is a result and the rest go on; a worker that was killed (LostWorkerError) ends the command, and the same
-    command resumes.
+    A failure is a result, and the other runs continue. A worker that was killed (LostWorkerError) ends the command, and
+    the same command resumes.
 
     Args:
         capture: The recording's folder, or one video; relative to the repository.
         study: A name under configs/stability/, or a YAML file.
         store: Folder of results.
-        methods: Presets in place of the study's; the table's name then ends in "-part".
-        only: Names of degradations; likewise.
+        methods: Presets instead of the study's; the table's name then ends in "-part".
+        only: Names of degradations; the table's name then ends in "-part".
     """
     whole = load_stability(study)
     plan = whole.restricted_to(only)
@@ -90,7 +90,7 @@ def stability(
             result["protocol"] = run.pop("protocol", None) or result["protocol"]
             result["runs"].append(run)
             _write_table(result, [], table)
-    except BaseException:  # Ctrl-C as well
+    except BaseException:  # including Ctrl-C
         if result["runs"]:
             with contextlib.suppress(Exception):  # an error here would hide the one that ended the study
                 _write_table(result, _draw_charts(result, table), table)
@@ -103,8 +103,8 @@ def stability(
 def _runs(
     store: Store, source: Source, truth: Source, plan: StabilityStudy, presets: dict[str, Settings]
 ) -> Iterator[Figures]:
-    """Yield every run's row: its method, degradation and verdict, and scores if there are any; or {"left_out": what and
-    why}."""
+    """Yield a row for every run: its method, degradation, verdict and, if there are any, scores; or {"left_out": what
+    and why}."""
     tried = [(kind, strength) for kind, strengths in plan.degradations.items() for strength in strengths]
     for method, preset in presets.items():
         recording = ingest_part(store, source, plan.part, preset)
@@ -137,8 +137,8 @@ def _runs_of_seed(method: str, as_recorded: "Attempt", tried: Sequence[tuple[str
 
 
 def verdict_row(found: Figures, good: Figures) -> Figures:
-    """Return a run's verdict, whether it is near a border, and means over the images and surfaces that both runs have,
-    None if there are none; with those of the good run as "reference"."""
+    """Return a run's verdict, whether it is near a border, and the mean scores over the images and surfaces that both
+    runs have, None if there are none. "reference" holds those of the good run."""
     row: Figures = {}
     near = False
     if "error" in found:
@@ -154,7 +154,7 @@ def verdict_row(found: Figures, good: Figures) -> Figures:
 
 
 def means_in_common(one: Figures, other: Figures) -> Figures:
-    """Return the means of one run's scores over the images and surfaces that the other has as well, and their
+    """Return the means of one run's scores over the images and surfaces that the other run has as well, and their
     counts."""
     images = [score for view, score in one["images"].items() if view in other["images"]]
     surfaces = [chamfer_mm for frame, chamfer_mm in one["surfaces"].items() if frame in other["surfaces"]]
@@ -166,8 +166,8 @@ def means_in_common(one: Figures, other: Figures) -> Figures:
 
 @dataclass(frozen=True)
 class Attempt:
-    """A training on a recording that is degraded in one way; as it was recorded where that is None. truth: the
-    recording's."""
+    """A training on a recording that is degraded in one way, or, without a degradation, as recorded. truth: the
+    recording's ground truth."""
 
     store: Store
     recording: Artifact
@@ -177,19 +177,19 @@ class Attempt:
 
     @staticmethod
     def of_seed(store: Store, recording: Artifact, truth: Source, preset: Settings, seed: int) -> "Attempt":
-        """Return the training of a preset with a seed of its own on the recording as it is."""
+        """Return the training of a preset, with this seed, on the recording as it is."""
         training = preset.training.model_copy(update={"seed": seed})
         return Attempt(store, recording, truth, preset.model_copy(update={"training": training}))
 
     @property
     def target(self) -> str | None:
-        """Return what the degradation changes, None without one."""
+        """Return what the degradation changes; None without a degradation."""
         return KINDS[self.degradation.kind].target if self.degradation else None
 
     def outcome(self) -> Figures:
-        """Return the result of `measure`, or {"error": (verdict, reason)}: refused if bad input was reported before or
-        by training, failed for any other error; or {"left_out": reason} if the degradation is not applicable to the
-        capture."""
+        """Return the result of `measure`, or {"error": (verdict, reason)}: "refused" if bad input was reported before
+        or by training, "failed" for any other error. Return {"left_out": reason} if the degradation does not apply to
+        the capture."""
         at_bad_input = "refused"
         try:
             prepared, training_settings = self.prepare(), self.settings.training
@@ -209,7 +209,7 @@ class Attempt:
             return {"error": ("failed", one_line(error))}
 
     def prepare(self) -> Prepared:
-        """Run the stages before training, degraded at the degradation's target."""
+        """Run the stages before training, with the degradation applied to its target."""
         store, settings, change = self.store, self.settings, self.degradation
         recording = self.recording
         if change and self.target == "capture":
@@ -257,7 +257,8 @@ class Attempt:
 
 
 def _images(metrics: Figures, split: str) -> dict[tuple[str, int], Figures]:
-    """Return the scores of each image by camera and frame; of animated poses also the PSNR posed and tracked."""
+    """Return the scores of each image by camera and frame; for animated poses, also the PSNR of the posed and the
+    tracked ones."""
     images = {(row["camera"], row["frame"]): dict(row) for row in metrics[split]["per_image"]}
     others = {"posed_psnr": POSED, "tracked_psnr": TRACKED} if split == ANIMATED else {}
     for key, other in others.items():
@@ -278,7 +279,7 @@ def _write_table(result: Figures, charts: list[str], table: Path) -> None:
 
 
 def _draw_charts(result: Figures, table: Path) -> list[str]:
-    """Draw the charts that there is data for; return their file names."""
+    """Draw the charts for which there is data; return their file names."""
     paths = {key: table.with_name(f"{table.stem}-{key}.png") for key in ("matrix", "psnr", "chamfer_mm")}
     for path in paths.values():
         path.unlink(missing_ok=True)  # left by an earlier call

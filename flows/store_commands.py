@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hnerf.errors import InputError, printable
 
-if TYPE_CHECKING:  # importing Prefect takes seconds, which help need not wait for
+if TYPE_CHECKING:  # importing Prefect takes seconds; help must not wait for that
     from tasks.store import Store
 
 UNITS_S = {"d": 86400, "h": 3600, "m": 60, "s": 1}

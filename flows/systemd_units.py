@@ -10,8 +10,8 @@ FOREVER = "Restart=always\nRestartSec=10"
 
 
 def units(root: Path) -> dict[str, str]:
-    """Return the text of each unit, for a checkout at `root`, by file name. The worker ends with all its runs; what
-    they had finished is in the store."""
+    """Return the text of each unit, by file name, for a checkout at `root`. The worker ends with all its runs; what
+    they have finished is in the store."""
     folder, prefect = _escaped(root), _escaped(root / ".venv" / "bin" / "prefect")
     server = f'"{prefect}" server start'
     worker = f'"{prefect}" worker start --pool local --type process --limit 2'
@@ -41,7 +41,7 @@ WantedBy=default.target
 
 
 def _escaped(path: Path) -> str:
-    """Return a path in which systemd replaces nothing. Raises InputError where it could not be written so."""
+    """Return a path in which systemd expands nothing. Raises InputError if the path cannot be written that way."""
     if '"' in str(path) or "\\" in str(path):
         raise InputError(f'{path}: systemd takes no path with " or \\; move the checkout')
     return str(path).replace("%", "%%")

@@ -34,11 +34,11 @@ from tasks.training import train
 
 log = logging.getLogger("hnerf.train")
 
-NOTED = (InputError, InvalidAsset, BucketError, RankFailedError, StalledError)  # whose message says all
+NOTED = (InputError, InvalidAsset, BucketError, RankFailedError, StalledError)  # their messages suffice
 
 
 class Prepared(NamedTuple):
-    """What training and evaluation take from the stages before them, in the order in which these tasks take it."""
+    """The results of earlier stages that training and evaluation take, in the order of these tasks' arguments."""
 
     recording: Artifact
     calibration: Artifact
@@ -47,8 +47,8 @@ class Prepared(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """What a run leaves. subject: the folder that links to the latest result of each stage, which may be another run's;
-    report, asset: this run's own files, no asset where the field has no poses to set."""
+    """The results of a run. subject: the folder that links to the latest result of each stage, which may come from
+    another run; report, asset: this run's own files; there is no asset if the field cannot be posed."""
 
     subject: Path
     report: Path
@@ -75,7 +75,7 @@ def train_subject(
 
 
 def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Sequence[str]) -> Trained:
-    """Run all stages on a capture, and show what came out on the page of the run."""
+    """Run all stages on a capture, and show the results on the page of the run."""
     settings = load_settings(preset, overrides)
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
@@ -127,7 +127,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
 
 @train_subject.on_failure
 def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
-    """Say why in the folder that is watched, if the capture was started from there."""
+    """Write the reason into the watched folder, if the capture was started from there."""
     capture, store = place(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
     error = state.result(raise_on_failure=False)
     if isinstance(error, Exception):
@@ -138,7 +138,7 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
 
 @train_subject.on_completion
 def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
-    """Take back what an earlier run noted."""
+    """Remove the note of an earlier run."""
     capture = place(flow_run.parameters["capture"])
     if isinstance(capture, Path):
         with suppress(OSError):
@@ -146,8 +146,8 @@ def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
 
 
 def local_folder(store: Store, capture: Path | str) -> Path:
-    """Return a capture's folder or video; what is in a bucket is fetched. One that cannot be found may be started again
-    from wherever it lies now."""
+    """Return a capture's folder or video; fetch it if it is in a bucket. If it cannot be found, release it, so that it
+    may be started again from wherever it is now."""
     if isinstance(capture, Path):
         if not capture.exists():
             forget(store.root, capture)
@@ -161,8 +161,8 @@ def local_folder(store: Store, capture: Path | str) -> Path:
 
 
 def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
-    """Return the recording with people detected by a network if it needs that, and with points of the subject's hands
-    if they are wanted and the network is installed."""
+    """Return the recording with people detected by a network, if it needs that, and with keypoints of the subject's
+    hands, if they are wanted and the network is installed."""
     wanted, network = needs_detection(recorded, settings.detection), settings.detection
     recording = detect(store, recorded, network.source, network.size) if wanted else recorded
     return find_hands(store, recording) if needs_hands(recording, settings.detection) else recording
@@ -174,7 +174,7 @@ def prepare_training(store: Store, recording: Artifact, settings: Settings) -> P
 
 
 def segment_and_fit(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Prepared:
-    """Do the same for a recording whose cameras were calibrated."""
+    """Run the stages between calibration and training."""
     segmentation = segment_subject(store, recording, calibration, settings)
     body = fit(store, recording, calibration, segmentation, settings.fit)
     return Prepared(recording, calibration, segmentation, body)
@@ -191,8 +191,8 @@ def calibrated_held_out_cameras(recording: Artifact, calibration: Artifact, sett
 def evaluate_without_camera(
     camera: str, store: Store, recording: Artifact, calibration: Artifact, segmentation: Artifact, settings: Settings
 ) -> Artifact:
-    """Segment, fit and train without a camera, and score the result on that camera under its masks of `segmentation`.
-    The calibration is that of all cameras."""
+    """Segment, fit and train without a camera, and score the result on that camera, under its masks of `segmentation`.
+    The calibration uses all cameras."""
     others = tuple(name for name in calibrated_capture(recording, calibration).train_cameras if name != camera)
     prepared = segment_and_fit(store, subset_capture(store, recording, others, None, None), calibration, settings)
     training = train(store, *prepared, settings.training)
@@ -215,7 +215,7 @@ def segment_subject(store: Store, recording: Artifact, calibration: Artifact, se
 
 
 def _key_pictures(calibration: Artifact, evaluation: Artifact) -> list[tuple[str, Path]]:
-    """Return the first rendering of each split, and the cameras, with captions."""
+    """Return the first rendering of each split, and the image of the cameras, with captions."""
     renders = evaluation.root / "renders"
     firsts = [(split.name, min(split.glob("*/*.png"), default=None)) for split in sorted(renders.glob("*"))]
     shown = [(name.replace("_", " "), path) for name, path in firsts if path]
@@ -224,7 +224,7 @@ def _key_pictures(calibration: Artifact, evaluation: Artifact) -> list[tuple[str
 
 
 def _figures(subject: str, evaluation: Artifact, training: Artifact, trained: Trained) -> str:
-    """Format the scores, the cost, and the paths of report and asset."""
+    """Format the scores, the cost, and the paths of the report and the asset."""
     lines = [f"# {subject}", "", "| figure | value |", "|---|---|"]
     lines += [f"| {name} | {value:.4g} |" for name, value in evaluation.metrics.items()]
     lines += [f"| training {name} | {value:.4g} |" for name, value in training.metrics.items()]

@@ -1,10 +1,10 @@
 """The ledger of a watched folder: which captures were started, by their content.
 
-    <store>/ingested/<digest>         the folder and the flow run of a capture that was started
-    <store>/ingested/<digest>.lost    the flow run that did not find its folder; the capture may be started again
-    <store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
-    <store>/ingested/new-<listing>    a listing in a bucket that is not started yet; written when it was first seen
-    <store>/ingested/id               random, so that the same key in another ledger is another run
+<store>/ingested/<digest>         the folder and the flow run of a capture that was started
+<store>/ingested/<digest>.lost    the flow run that did not find its folder; the capture may be started again
+<store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
+<store>/ingested/new-<listing>    a listing in a bucket that is not started yet; written when it was first seen
+<store>/ingested/id               random, so that the same key in another ledger is another run
 """
 
 import time

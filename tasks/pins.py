@@ -1,6 +1,6 @@
 """The artifacts that running processes use, recorded so that none is removed while in use.
 
-    <store>/.running/<random>  lines `<stage>/<key>`; locked (flock) by a process while it lives, released by the kernel
+<store>/.running/<random>  lines `<stage>/<key>`; locked (flock) by a process while it lives, released by the kernel
 """
 
 import errno
