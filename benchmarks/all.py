@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def listing(root: Path, results: Sequence[Result]) -> list[str]:
-    """Return a table of results: fresh or the reason why not, and what is recorded of each."""
+    """Return a table of results: whether each is fresh or why not, and what is recorded about it."""
     records = load_records(root)
     rows = [["result", "state", "seconds", "code", "commit"]]
     for result in results:
@@ -64,7 +64,7 @@ def listing(root: Path, results: Sequence[Result]) -> list[str]:
 
 
 def make(root: Path, results: Sequence[Result], store: Path, jobs: int) -> int:
-    """Make those results that are not fresh, in order, as cores are free; return 1 if any failed."""
+    """Make the results that are not fresh, in order, as cores become free; return 1 if any failed."""
     clean_commit(root)
     waiting, running, failed = [], list[Job](), dict[str, str]()
     for result in results:
@@ -88,7 +88,7 @@ def make(root: Path, results: Sequence[Result], store: Path, jobs: int) -> int:
                 if fault:
                     failed[job.result.name] = fault
                 print(f"{job.result.name}: {fault or f'{job.watch.seconds:.0f} s'}", flush=True)
-    finally:  # after Ctrl-C, or a change of the checkout meanwhile
+    finally:  # after Ctrl-C, or if the checkout has changed meanwhile
         for job in running:
             job.stop()
     for name, fault in failed.items():
@@ -97,7 +97,7 @@ def make(root: Path, results: Sequence[Result], store: Path, jobs: int) -> int:
 
 
 def reason_to_skip(root: Path, result: Result, jobs: int) -> str | None:
-    """Return why a result is skipped; None if it is to be made."""
+    """Return why a result is skipped; None if it must be made."""
     if stale_reason(root, result, load_records(root)) is None:
         return "fresh"
     absent = [name for name in result.captures if not (root.parent / "shared" / "data" / name).is_dir()]
@@ -109,7 +109,7 @@ def reason_to_skip(root: Path, result: Result, jobs: int) -> str | None:
 
 
 class Job:
-    """A running program that makes one result, with the commit and code digest it started from."""
+    """A running program that makes one result, with the commit and code digest from which it started."""
 
     def __init__(self, root: Path, result: Result, store: Path) -> None:
         self.root, self.result = root, result
@@ -144,13 +144,13 @@ class Job:
         return self.process.poll() is None
 
     def stop(self) -> None:
-        """End the program and what it has started; its time counts when the same work is resumed."""
+        """End the program and all that it has started; its time counts when the same work is resumed."""
         self.process.terminate()
         self.process.wait()
         self.watch.save(done=False)
 
     def finish(self) -> str | None:
-        """Record the result of a program that has ended; return why there is none."""
+        """Record the result of a program that has ended; if there is none, return why."""
         fault = self._fault()
         self.watch.save(done=fault is None)
         if fault:
@@ -172,8 +172,8 @@ class Job:
         return None
 
     def _reused(self) -> bool:
-        """Return whether a training was used that another result, or a command, had left in the store: its folder is
-        from before, and its record, which is touched at each use, is not."""
+        """Return whether the program used a training that another result, or a command, had left in the store. Its
+        folder is then older than this run, but its record, which is touched at each use, is newer."""
         records = (self.store / "training").glob("*.json")
         return any(
             record.with_suffix("").stat().st_mtime < self.watch.began < record.stat().st_mtime
@@ -196,8 +196,8 @@ class Job:
 
 
 def environment(root: Path, threads: int) -> dict[str, str]:
-    """Return an environment in which this checkout's packages come before installed ones and numeric libraries use so
-    many threads."""
+    """Return an environment in which this checkout's packages take precedence over installed ones and numeric libraries
+    use this many threads."""
     counted = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
     return os.environ | counted | {"PYTHONPATH": str(root)}
 

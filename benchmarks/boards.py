@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """Format the goals, a table by camera and one by pair."""
+    """Format the goals, a table by camera and a table by pair."""
     figures, cameras = result["figures"], result["report"]["cameras"]
     goals = [
         ["", "measured", "goal"],

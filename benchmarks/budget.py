@@ -56,8 +56,8 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
 
 
 def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[TrainingSettings, dict[str, Any]]:
-    """Return the training's settings with all automatic ones filled in, and its scores, including the reasons for
-    them."""
+    """Return the training's settings with all automatic ones filled in, and its scores, together with the reasons for
+    these settings."""
     source, truth = read_capture(folder)
     recording = ingest(store, source, settings.capture)
     prepared = prepare_training(store, recording, settings)
@@ -69,7 +69,7 @@ def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[Tra
 
 
 def resized(training: TrainingSettings, factor: float) -> TrainingSettings:
-    """Return the settings with so many times the cells, samples a ray, and nodes that deform the body."""
+    """Return the settings with `factor` times as many cells, samples per ray, and nodes that deform the body."""
     field, side = training.field, float(np.cbrt(factor))
     changes = {
         "colour_cells": tuple(round(side * n) for n in field.colour_cells),
@@ -81,7 +81,7 @@ def resized(training: TrainingSettings, factor: float) -> TrainingSettings:
 
 
 def figures(found: dict[str, Any]) -> dict[str, Any]:
-    """Return the scores of a variant that the table shows."""
+    """Return the scores of a variant that are shown in the table."""
     report, view, pose = found["training"], found["novel_view"], found["novel_pose"]
     geometry = view["geometry"] or {}
     return {
@@ -96,7 +96,7 @@ def figures(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def as_markdown(captures: dict[str, Any]) -> str:
-    """Format a section for each capture: automatic settings with reasons, then variants beside them."""
+    """Format a section for each capture: automatic settings with reasons, then a table of the variants."""
     lines = ["# Settings chosen from the scene"]
     for name, found in captures.items():
         decisions = [[key, f"{d['value']}", d["reason"]] for key, d in found["decisions"].items()]

@@ -44,9 +44,9 @@ MILLIMETRES = "millimetres"
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """A way to break cameras. change: applied to a camera with a random generator; rig: to all cameras instead of one;
-    frames: offset by which the camera's recording starts too late or too early; cause: the reason that must be named;
-    share: of all trials."""
+    """A way to break cameras. share: of all trials; change: applied to a camera with a random generator; rig: whether
+    to change all cameras instead of one; frames: offset by which the camera's recording starts too late or too early;
+    cause: the reason that must be named."""
 
     share: float
     change: Callable[[Camera, np.random.Generator], Camera] = lambda camera, rng: camera
@@ -126,7 +126,7 @@ def _trials(name: str, trials: int, untouched: int) -> list[dict[str, Any]]:
 
 @contextmanager
 def evidence_collected_once(whole: Capture) -> Iterator[None]:
-    """Let every capture meanwhile have the outlines and matches of the whole one."""
+    """Give all captures meanwhile the outlines and matches of the whole one."""
     outlines, matches = cache(partial(Outlines.of, whole)), Matches.of(whole)
     with (
         mock.patch.object(Outlines, "of", lambda _, *frames: outlines(*frames)),
@@ -156,7 +156,7 @@ class Trial:
 
     @staticmethod
     def _camera(whole: Capture, fault: Fault, seed: int) -> str:
-        """Return the camera to break, each in turn; one that the fault would not change (its R is symmetric) is
+        """Return the camera to break, each in turn. A camera that the fault would not change (its R is symmetric) is
         skipped."""
         names, rng = whole.train_cameras, np.random.default_rng(seed)
         broken = {name: fault.change(whole.cameras[name], rng).projection for name in names}
@@ -164,7 +164,7 @@ class Trial:
         return (changed_names or names)[seed % len(changed_names or names)]
 
     def run(self) -> dict[str, Any]:
-        """Run the calibration stage; return what it reports and the remaining error."""
+        """Run the calibration stage; return its findings and the remaining error."""
         capture, started = self._broken(), time.perf_counter()
         try:
             report = check_calibration(capture, CalibrationSettings())
@@ -216,14 +216,14 @@ class Trial:
         return max(medians_px)
 
     def _keypoints_at(self, instants: Any) -> np.ndarray:
-        """Interpolate the exact keypoints between frames, (n, 25, 3) m."""
+        """Interpolate the exact keypoints between frames; return (n, 25, 3) in metres."""
         every = np.arange(len(self.truth_m))
         flat = self.truth_m.reshape(len(every), -1)
         return np.stack([np.interp(instants, every, column) for column in flat.T], -1).reshape(-1, 25, 3)
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """Format one table a capture."""
+    """Format one table per capture."""
     assert __doc__
     lines = ["# Calibration faults", "", provenance_line(result), "", __doc__.split("\n\n")[2].split(" Needs ")[0]]
     for name, found in result["captures"].items():

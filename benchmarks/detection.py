@@ -31,7 +31,7 @@ REAL, RENDERED = "pose2sim-balance", ("valid-walk", "valid-wave")
 DELIVERED = "delivered"
 SIZES = ("heavy", "full", "lite")
 LIMBS = [2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14]
-FRAMES = 16  # of each capture, evenly spaced: more say the same and take minutes
+FRAMES = 16  # of each capture, evenly spaced: more give the same figures and take minutes
 PROTOCOL = (
     "Keypoints are the twelve joints of arms and legs in the training cameras and 16 frames, evenly spaced: persons "
     "are tracked over jumps. pose2sim-balance is looked at as recorded, 1080 x 1920 px. Residual: distance in "
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def measure(folder: Path, scratch: Path) -> dict[str, Any]:
-    """Score the keypoints that a capture came with, and those of each size of the network."""
+    """Score the keypoints that a capture came with, and those of the network in each size."""
     everything = ingest(folder, CaptureSettings(max_side_px=1920), scratch / "everything")
     frames = tuple(evenly_spaced(everything.frames, FRAMES))
     train, novel = (
@@ -75,8 +75,8 @@ def measure(folder: Path, scratch: Path) -> dict[str, Any]:
 
 
 def cost_of_a_frame(capture: Capture, size: str, out: Path) -> dict[str, float]:
-    """Return the milliseconds of one core a frame of the first camera takes after the first one, and the most memory
-    that this process, which must be a new one, holds."""
+    """Return the milliseconds of one core's time for a frame of the first camera, without the first frame, and the peak
+    memory of this process, which must be a new one."""
     camera = capture.train_cameras[0]
     one = dataclasses.replace(capture, train_frames=capture.frames[:1], novel_pose_frames=())
     find_in_camera(one, camera, size, out / "warm")
@@ -95,7 +95,7 @@ def limb_keypoints(capture: Capture) -> np.ndarray:
 
 
 def score_residuals(folder: Path, capture: Capture) -> dict[str, Any]:
-    """Return the residuals of keypoints triangulated with the cameras as given."""
+    """Return the residuals of keypoints triangulated with the given cameras."""
     keypoints = limb_keypoints(capture)
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     projections = np.stack([camera.projection for camera in cameras])
@@ -105,8 +105,8 @@ def score_residuals(folder: Path, capture: Capture) -> dict[str, Any]:
 
 
 def score_truth(folder: Path, capture: Capture) -> dict[str, Any]:
-    """Return the errors of keypoints against the true joints, and of the network's masks, if any, against the true
-    ones."""
+    """Return the errors of keypoints against the true joints, and, if there are masks by the network, the IoU of these
+    with the true ones."""
     stored = np.load(folder / "ground_truth" / "joints.npz")
     joints_m = stored["positions"][list(capture.frames)][:, LIMBS]
     true_px = np.stack(
@@ -141,7 +141,7 @@ def _percentiles(distances_px: np.ndarray, keypoints: np.ndarray) -> dict[str, A
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """Format a row for each capture and source of keypoints."""
+    """Format a row for each capture and each source of keypoints."""
     rows = [["capture", "keypoints", "median, px", "90 %, px", "missed", "mask IoU", "ms", "MiB"]]
     for name, figures in result["captures"].items():
         for source, f in figures.items():

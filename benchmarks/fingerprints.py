@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def jobs(scratch: Path) -> dict[str, tuple[Path, str, tuple[str, ...]]]:
-    """Return capture, preset and setting changes of each run."""
+    """Return capture, preset and changes of settings for each run."""
     moving, still = synthesise(scratch / "moving"), synthesise(scratch / "still", "train_frames=1")
     chosen = {"demo": (moving, "demo", ("asset.texture_px=256",))}
     wave = SHARED / "data" / "valid-wave"
@@ -69,7 +69,7 @@ def synthesise(folder: Path, *changes: str) -> Path:
 
 
 def run(capture: Path, preset: str, changes: tuple[str, ...], store: Path) -> Path:
-    """Run the pipeline; return the subject's folder. The asset of so short a training may be refused."""
+    """Run the pipeline; return the subject's folder. The asset of such a short training may be refused."""
     command = ["run", str(capture), "--preset", preset, "--store", str(store)]
     call(*command, *(f"--set={change}" for change in changes), may_fail=True)
     (subject,) = (store / "subjects").iterdir()
@@ -105,7 +105,7 @@ def fingerprint(subject: Path) -> dict[str, str]:
 
 
 def numbers(value: Any) -> Iterator[float]:
-    """Yield the numbers of a JSON value, in their order."""
+    """Yield the numbers in a JSON value, in order."""
     if isinstance(value, dict):
         for key, inner in value.items():
             if not UNSTABLE.search(key):

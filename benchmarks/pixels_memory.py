@@ -45,8 +45,8 @@ def main() -> None:
 
 
 def measure(processes: int) -> dict[str, float]:
-    """Return the GiB of all processes together before and after they have their pixels, and of the gathering one
-    meanwhile."""
+    """Return the GiB of all processes together before and after they get their pixels, and of the gathering process
+    while it gathers."""
     with socket.socket() as free, TemporaryDirectory() as folder:
         free.bind(("127.0.0.1", 0))
         os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
@@ -80,14 +80,13 @@ def run_process(rank: int, processes: int, folder: Path) -> None:
 
 
 def process_bytes(name: str) -> int:
-    """Return the bytes of this process under a name of Linux's smaps."""
+    """Return the bytes of this process under a name in Linux's smaps."""
     lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
 
 
 class Noise(SimpleNamespace):
-    """A fake capture of noise images. peak_bytes: the most bytes of its own that the process held when an image was
-    read."""
+    """A fake capture of noise images. peak_bytes: the most private memory held when an image was read."""
 
     peak_bytes = 0
 
@@ -98,11 +97,11 @@ class Noise(SimpleNamespace):
         return np.random.default_rng([int(camera), frame]).integers(0, 256, shape, np.uint8)
 
     def background(self, camera: str) -> None:
-        """Return None: there are no plates."""
+        """Return None, since there are no clean plates."""
 
 
 def synthetic_inputs() -> tuple[Any, Any, Any]:
-    """Return a fake capture, masks and body fit with what gathering whole images uses."""
+    """Return a fake capture, masks and body fit with the members that the gathering of whole images uses."""
     camera = SimpleNamespace(width_px=SIZE_PX, height_px=SIZE_PX, K=np.eye(3), R=np.eye(3), centre_m=np.zeros(3))
     names = tuple(f"{k}" for k in range(CAMERAS))
     by_name = {name: SimpleNamespace(**vars(camera), name=name) for name in names}

@@ -1,5 +1,5 @@
-"""What programs share: their arguments, the provenance of results, machine, commit and date, and how they are
-written."""
+"""What the programs share: their arguments, the provenance of results (machine, commit and date), and the writing of
+results."""
 
 import argparse
 import json
@@ -22,12 +22,12 @@ REFUSED = 2
 
 
 def arguments(doc: str | None) -> argparse.ArgumentParser:
-    """Return the parser of a program, which shows its docstring."""
+    """Return the argument parser of a program, which shows its docstring."""
     return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def store_and_captures(doc: str | None, captures: Sequence[str]) -> argparse.Namespace:
-    """Return the arguments STORE and, by default these, CAPTURE ... of a program."""
+    """Parse the arguments STORE and CAPTURE ... of a program. captures: the default."""
     parser = arguments(doc)
     parser.add_argument("store", type=Path)
     parser.add_argument("captures", nargs="*", default=captures, metavar="CAPTURE")
@@ -35,13 +35,13 @@ def store_and_captures(doc: str | None, captures: Sequence[str]) -> argparse.Nam
 
 
 def log_progress() -> None:
-    """Show what the package logs, with the time."""
+    """Show the package's log, with the time."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
 
 
 def provenance() -> dict[str, Any]:
-    """Return what heads every file of results. A program calls this first: like `clean_commit`, it ends the program if
-    results could not be attributed, also if hnerf is imported from another checkout."""
+    """Return the provenance that heads every file of results. A program calls this first. Like `clean_commit`, it ends
+    the program if results could not be attributed, and also if hnerf is imported from another checkout."""
     package = Path(hnerf.__file__).resolve().parent
     if package.parent != ROOT:
         _refuse(f"hnerf is imported from {package}; give PYTHONPATH={ROOT}")
@@ -55,7 +55,7 @@ def provenance_line(result: dict[str, Any]) -> str:
 
 def write_result(name: str, result: dict[str, Any], markdown: str) -> None:
     """Print the Markdown and write `benchmarks/results/NAME.json` and `.md`, unless the checkout has changed since the
-    program began."""
+    program started."""
     print(markdown)
     clean_commit(ROOT)
     RESULTS.mkdir(exist_ok=True)
@@ -64,13 +64,13 @@ def write_result(name: str, result: dict[str, Any], markdown: str) -> None:
 
 
 def table(rows: list[list[str]]) -> list[str]:
-    """Return the lines of a Markdown table; the first row is its head."""
+    """Return the lines of a Markdown table; the first row is its header."""
     return [*head(rows[0]), *map(line, rows[1:])]
 
 
 def clean_commit(root: Path) -> str:
-    """Return the checkout's commit; end the program with one line and exit code 2 if there is none, or if files other
-    than results differ from it or are untracked."""
+    """Return the checkout's commit. If there is none, or if files other than results differ from it or are untracked,
+    end the program with one line and exit code 2."""
 
     def git(*arguments: str) -> str:
         return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True).stdout

@@ -20,7 +20,7 @@ from hnerf.geometry.mesh_queries import Surface
 
 
 def main() -> None:
-    """Write the picture."""
+    """Write the image."""
     parser = arguments(__doc__)
     parser.add_argument("subject", type=Path)
     parser.add_argument("--camera", default="05")

@@ -1,4 +1,4 @@
-"""Registry of the committed results: what makes each, and what it needs."""
+"""Registry of the committed results: which program makes each, and what it needs."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ RENDERED = (*CALIBRATED, "valid-turn-mono")
 FEW = ("evaluation.max_images=12", "evaluation.max_meshes=3")  # per split, since each takes a quarter of a minute
 
 PAPERS_ROWS = ("mask", "blend", "geometry", "segmentation", "eikonal", "residual", "opt", "root", "noise")
-SMALL = "size_px=128"  # for many images of NeRF, each of which takes 18 s at 256 px
+SMALL = "size_px=128"  # for many images by NeRF, which takes 18 s for each at 256 px
 MOMENT = (SMALL, "train_frames=1", "novel_pose_frames=0")
 LARGE = tuple(
     f"--synth={setting}"
@@ -18,12 +18,13 @@ LONG_WALK = ("train_frames=40", "novel_pose_frames=24")
 
 @dataclass(frozen=True)
 class Result:
-    """A result: files of one name under benchmarks/results/.
+    """A result: files with a common name under benchmarks/results/.
 
-    command: a program under benchmarks/ and its arguments, where {store} is the store of all results, and {new} a
-    folder that no other result and no other version of the code uses, for programs that time all of their work; files:
-    patterns under benchmarks/results/; captures: under ../shared/data; configs: patterns under configs/ without
-    ".yaml"; runs: modules that the program starts and does not import; threads: of the program; gpu: it needs one.
+    command: a program under benchmarks/ and its arguments. In these, {store} is the store of all results; {new} is a
+    folder that no other result and no other version of the code uses, for programs that time all of their work. files:
+    patterns under benchmarks/results/; captures: names under ../shared/data; configs: patterns under configs/ without
+    ".yaml"; runs: modules that the program starts but does not import; threads: used by the program; gpu: whether it
+    needs one.
     """
 
     name: str
@@ -39,14 +40,15 @@ class Result:
 def measured(
     name: str, *command: str, captures: tuple[str, ...] = (), configs: tuple[str, ...] = (), threads: int = 1
 ) -> Result:
-    """Return a result of a JSON file, a table and, for some, a chart."""
+    """Return a result that has a JSON file, a table and, in some cases, a chart."""
     return Result(name, command, (f"{name}.*",), captures, configs, threads=threads)
 
 
 def shared(
     name: str, capture: str, preset: str = "fast", *changes: str, without: tuple[str, ...] = (), threads: int = 1
 ) -> Result:
-    """Return a result of the whole pipeline on one capture, timed; `without` names folders that the capture lacks."""
+    """Return a timed result of the whole pipeline on one capture. without: names of folders that are removed from the
+    capture."""
     command = ("score_shared.py", capture, "--preset", preset, "--store", "{new}", "--name", name)
     command += tuple(f"--set={change}" for change in changes)
     command += ("--without", *without) if without else ()
@@ -54,7 +56,8 @@ def shared(
 
 
 def on_gpu(capture: str, preset: str, *changes: str) -> Result:
-    """Return a result of training and evaluation on a GPU, of a subject that is in the store up to its body fit."""
+    """Return a result of training and evaluation on a GPU, for a subject whose stages up to the body fit are in the
+    store."""
     name = f"gpu-{preset}-{capture}"
     command = ("gpu.py", f"{{store}}/subjects/{capture}", f"../shared/data/{capture}", "{new}", "--preset", preset)
     command += tuple(f"--set={change}" for change in changes)
@@ -70,8 +73,8 @@ def study(
     store: str = "{store}",
     threads: int = 1,
 ) -> Result:
-    """Return a benchmark or stability study of valid-wave, or of the performer in a capture with settings `synth`;
-    seconds: of each training, in place of the study's."""
+    """Return a benchmark or stability study of valid-wave, or of the synthetic performer in a capture with settings
+    `synth`. seconds: of each training, instead of the study's."""
     capture = "performer" if synth else "valid-wave"
     title = f"{kind}/{capture}-{name}"
     command = ("studies.py", store, capture, kind, name, "--methods", ",".join(methods))
@@ -83,7 +86,8 @@ def study(
 
 
 def ablations(preset: str, *changes: str, rows: tuple[str, ...] = ()) -> Result:
-    """Return a study of the method without each part, or without those that rows name, on valid-wave."""
+    """Return a study on valid-wave of the method without each of its parts, or only without the parts that `rows`
+    names."""
     command = ("studies.py", "{store}", "valid-wave", "ablations", preset)
     command += tuple(f"--set={change}" for change in changes)
     command += ("--methods", ",".join(f"no-{row}" for row in rows)) if rows else ()

@@ -37,7 +37,7 @@ STEPS = 60
 SHARES = (0.25, 0.5)
 MARKERS = "os^Dv"
 Cost = tuple[float, float]  # seconds, GiB
-Part = tuple[Artifact, tuple[str, ...] | None, tuple[int, ...] | None]  # of a recording: training cameras and frames
+Part = tuple[Artifact, tuple[str, ...] | None, tuple[int, ...] | None]  # training cameras and frames of a recording
 
 
 def main() -> None:
@@ -78,20 +78,19 @@ def measure_parts(capture: Path, scratch: Path) -> dict[str, dict[int, dict[str,
         axis: {amount: measure(store, subset_capture(store, *part, ())) for amount, part in by_amount.items()}
         for axis, by_amount in parts.items()
     }
-    whole = measure(store, subset_capture(store, recording, None, None, ()))  # last: its memory would stay allocated
+    whole = measure(store, subset_capture(store, recording, None, None, ()))  # last: its memory stays allocated
     amounts = {"frames": len(frames), "cameras": len(cameras), "pixels": pixels_of(recording)}
     return {axis: rows | {amounts[axis]: whole} for axis, rows in costs.items()}
 
 
 def pixels_of(recording: Artifact) -> int:
-    """Return the pixels of an image of the first training camera."""
+    """Return the number of pixels in an image of the first training camera."""
     capture = Capture.load(recording.root)
     return math.prod(capture.cameras[capture.train_cameras[0]].size_px)
 
 
 def parts_of(whole: int) -> list[int]:
-    """Return a quarter and a half of a number of frames or cameras, rounded, in ascending order, without those that
-    are none."""
+    """Return a quarter and a half of a number of frames or cameras, rounded, in ascending order, without zeros."""
     return sorted({amount for share in SHARES if (amount := round(share * whole))})
 
 
@@ -111,7 +110,7 @@ def measure(store: Store, recording: Artifact) -> dict[str, Cost]:
     segmentation = timed("segmentation", lambda: segment_subject(store, recording, calibration, settings))
     body = timed("fit", lambda: fit(store, recording, calibration, segmentation, settings.fit))
     training = timed("training", lambda: train(store, recording, calibration, segmentation, body, settings.training))
-    costs["training"] = costs["training"][0], training.metrics["peak_memory_gib"]  # of its own process
+    costs["training"] = costs["training"][0], training.metrics["peak_memory_gib"]  # training runs in a separate process
     avatar, capture = load_trained_avatar(training), calibrated_capture(recording, calibration)
     camera = capture.cameras[capture.train_cameras[0]]
     avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
@@ -120,7 +119,7 @@ def measure(store: Store, recording: Artifact) -> dict[str, Cost]:
 
 
 def draw(costs: dict[str, dict[int, dict[str, Cost]]], path: Path) -> None:
-    """Draw a panel for each axis, both scales logarithmic; grey lines have the slope of proportional cost."""
+    """Draw a panel for each axis, with both scales logarithmic. Grey lines have the slope of proportional cost."""
     figure = Figure(figsize=(11, 3.8), layout="constrained")
     for axes, (axis, rows) in zip(
         figure.subplots(1, len(costs), sharey=True, squeeze=False)[0], costs.items(), strict=True

@@ -63,12 +63,12 @@ def lacking(capture: Path, folders: list[str], store: Path) -> Path:
     if absent:
         raise SystemExit(f"{capture / absent[0]}: no such folder to leave out")
     copy = store / "captures" / capture.name
-    shutil.rmtree(copy, ignore_errors=True)  # which may have what is to be left out now
+    shutil.rmtree(copy, ignore_errors=True)  # an old copy may have folders that must be left out now
     return Path(shutil.copytree(capture, copy, ignore=lambda folder, _: folders if Path(folder) == capture else []))
 
 
 def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> dict[str, Any]:
-    """Run the pipeline on one capture and score it; return {"error": its last line} if it fails."""
+    """Run the pipeline on one capture and score it; return {"error": the last line of output} if it fails."""
     command = [str(Path(sys.executable).with_name("hnerf")), "run", str(capture), "--preset", preset]
     command += ["--store", str(store), *(f"--set={override}" for override in overrides)]
     known, started = (store / "subjects" / capture.name).exists(), time.perf_counter()
@@ -89,7 +89,7 @@ def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> di
 
 
 def score(subject: Path, capture: Path) -> dict[str, Any] | None:
-    """Return the scores by the independent program; None if the capture has no ground truth."""
+    """Return the scores by the independent program, or None if the capture has no ground truth."""
     if not (capture / "ground_truth").is_dir():
         return None
     command = [sys.executable, str(SCORE_RUN), str(subject), str(capture)]
@@ -97,7 +97,7 @@ def score(subject: Path, capture: Path) -> dict[str, Any] | None:
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """Format one table a split, after the machine and before the protocol."""
+    """Format one table per split, after the machine and before the protocol."""
     changes = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
     changes += f" without {', '.join(result['without'])}" if result["without"] else ""
     lines = [
@@ -127,15 +127,16 @@ def _split_table(captures: dict[str, Any], split: str) -> list[str]:
 
 
 def score_cells(found: dict[str, Any]) -> list[str]:
-    """Format a split's number of images, and its scores in the order of IMAGE_COLUMNS and GEOMETRY_COLUMNS; empty where
-    there is none."""
+    """Format a split's number of images and its scores, in the order of IMAGE_COLUMNS and GEOMETRY_COLUMNS. A missing
+    score is an empty cell."""
     columns, values = IMAGE_COLUMNS | GEOMETRY_COLUMNS, found | (found["geometry"] or {})
     shown = (form.format(values[key]) if values.get(key) is not None else "" for key, (_, form) in columns.items())
     return [str(found["n"]), *shown]
 
 
 def _columns_table(captures: dict[str, Any]) -> list[str]:
-    """Return the table of PSNR / SSIM / mask IoU of animated, posed and tracked poses, or why there are none."""
+    """Return a table of PSNR / SSIM / mask IoU for animated, posed and tracked poses, or the reasons why there are
+    none."""
     rows = [["capture", "animated", "posed", "tracked"]]
     for name, figures in captures.items():
         if "error" not in figures:
@@ -145,7 +146,8 @@ def _columns_table(captures: dict[str, Any]) -> list[str]:
 
 
 def _holdout_table(captures: dict[str, Any]) -> list[str]:
-    """Return the table of PSNR / SSIM / mask IoU of every held-out camera, and their mean, or why there are none."""
+    """Return a table of PSNR / SSIM / mask IoU for every held-out camera and their mean, or the reasons why there are
+    none."""
     rows = [["capture", "camera left out", "training poses", "new poses, animated"]]
     for name, figures in captures.items():
         if "error" in figures:

@@ -80,7 +80,7 @@ def measure(folder: Path, sheet: Path | None) -> dict[str, Any]:
 
 
 def _timed_segment(capture: Capture, body: BodyFit | None) -> tuple[Masks, float]:
-    """Segment; return the masks and milliseconds a frame."""
+    """Segment; return the masks and the milliseconds per frame."""
     began = time.perf_counter()
     masks = segment(capture, body, SETTINGS)
     return masks, 1e3 * (time.perf_counter() - began) / (len(capture.train_cameras) * len(capture.frames))
@@ -108,7 +108,7 @@ def ious(folder: Path, capture: Capture, masks: Masks) -> dict[tuple[str, int], 
 
 
 def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
-    """Return mean and worst IoU, and false and missing pixels as shares of the person's area."""
+    """Return the mean and the worst IoU, and the false and missing pixels as shares of the person's area."""
     by_view = ious(folder, capture, masks)
     wrong = []
     for view in masks.encoded:
@@ -125,7 +125,7 @@ def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
 
 
 def truth(folder: Path, camera: str, frame: int) -> np.ndarray:
-    """Return the true mask, (H, W) bool: True where the ray through the pixel's centre meets the person."""
+    """Return the true mask, (H, W) bool: True where the ray through the pixel's centre hits the person."""
     image = cv2.imread(str(folder / "ground_truth" / "masks" / camera / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE)
     assert image is not None, f"{folder}: no true mask of camera {camera}, frame {frame}"
     return image > 127
@@ -145,7 +145,7 @@ def worst_frames(folder: Path, capture: Capture, masks: Masks) -> np.ndarray:
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """Format a row for each capture and kind, then the means that have a goal."""
+    """Format a row for each capture and kind, then the means for which there is a goal."""
     rows = [["capture", "", "IoU", "worst", "false", "missing", "dropped", "ms/frame", "IoU by round", "moved, px"]]
     for name, figures in result["captures"].items():
         for kind in GOALS:

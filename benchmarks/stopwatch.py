@@ -1,4 +1,4 @@
-"""Stopwatch for the time of a result across interruptions."""
+"""Stopwatch that measures the time of a result across interruptions."""
 
 import json
 import time
@@ -11,8 +11,9 @@ SAVE_S = 10.0
 class Stopwatch:
     """A stopwatch that runs from its creation, and continues from the file of an interrupted run of the same code.
 
-    is_complete: whether `seconds` cover all the work; they do not if, by the file, an earlier run of other code, or one
-    that ended, may have left something to reuse. began: when the first of the runs did, in seconds since the epoch.
+    is_complete: whether `seconds` covers all the work. It does not if, according to the file, an earlier run may have
+    left something to reuse, because it had other code or had ended. began: when the first of the runs began, in seconds
+    since the epoch.
     """
 
     def __init__(self, path: Path, digest: str) -> None:
@@ -32,7 +33,7 @@ class Stopwatch:
         return self.earlier_s + time.monotonic() - self.started_s
 
     def tick(self) -> bool:
-        """Save every few seconds, in case this process is killed; return whether it did."""
+        """Save every few seconds, in case this process is killed; return whether it saved."""
         due = time.monotonic() - self.saved_s > SAVE_S
         if due:
             self.save(done=False)

@@ -47,12 +47,12 @@ def main() -> None:
         table = ablate.fn(folder, options.study, options.store, [*FEW, *options.overrides], methods)
     else:
         table = stability.fn(folder, options.study, options.store, methods)
-    clean_commit(ROOT)  # refuse if it changed during the study
+    clean_commit(ROOT)  # refuse if the checkout has changed during the study
     kept = RESULTS / options.kind
     kept.mkdir(parents=True, exist_ok=True)
     name = table.stem if options.kind == "ablations" else table.stem.removesuffix("-part")
     for path in [*table.parent.glob(f"{table.stem}.*"), *table.parent.glob(f"{table.stem}-*.png")]:
-        if "-part" in path.stem.removeprefix(table.stem):  # of a part, beside the whole
+        if "-part" in path.stem.removeprefix(table.stem):  # belongs to a part of the study, not to the whole
             continue
         shutil.copy(path, kept / path.name.replace(table.stem, name))
     text = f"{table.read_text().replace(table.stem, name)}\nMade by `benchmarks/studies.py`: {where}\n"
@@ -61,12 +61,12 @@ def main() -> None:
 
 
 def capture_folder(name: str, synth: list[str], store: Path) -> Path:
-    """Return the folder of a capture; the performer's is written."""
+    """Return the folder of a capture; the performer's capture is written first."""
     if name != "performer":
         shared = SHARED / "data" / name
         return shared if shared.is_dir() else Path(name)
     folder = store / "synthetic" / ",".join(["performer", *synth])
-    shutil.rmtree(folder, ignore_errors=True)  # written by other code, perhaps
+    shutil.rmtree(folder, ignore_errors=True)  # it may have been written by other code
     with atomic_folder(folder) as partial:
         write_synthetic_capture(partial, overridden(SyntheticSettings(), synth))
     return folder

@@ -28,7 +28,7 @@ def main(out: Path, performer: SyntheticSettings, overrides: Sequence[str] = ())
     write_synthetic_capture(out / "performer", performer)
     capture = ingest(out / "performer", settings.capture, folders["capture"])
     check_calibration(capture, settings.calibration).save(folders["calibration"])
-    capture = load_cameras(folders["calibration"], capture)  # the same pictures through the cameras to use from here on
+    capture = load_cameras(folders["calibration"], capture)  # the same images, with the cameras to use from here on
     masks = segment(capture, None, settings.segmentation)  # None: the clean plates are enough, no body is needed
     masks.save(folders["segmentation"])
     body, _ = fit_body(capture, masks, settings.fit)
