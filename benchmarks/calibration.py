@@ -126,7 +126,7 @@ def _trials(name: str, trials: int, untouched: int) -> list[dict[str, Any]]:
 
 @contextmanager
 def evidence_collected_once(whole: Capture) -> Iterator[None]:
-    """Give all captures meanwhile the outlines and matches of the whole one."""
+    """While this is open, give all captures the outlines and matches of the whole capture."""
     outlines, matches = cache(partial(Outlines.of, whole)), Matches.of(whole)
     with (
         mock.patch.object(Outlines, "of", lambda _, *frames: outlines(*frames)),

@@ -105,8 +105,8 @@ def score_residuals(folder: Path, capture: Capture) -> dict[str, Any]:
 
 
 def score_truth(folder: Path, capture: Capture) -> dict[str, Any]:
-    """Return the errors of keypoints against the true joints, and, if there are masks by the network, the IoU of these
-    with the true ones."""
+    """Return the errors of keypoints against the true joints and, if the network made masks, their IoU with the true
+    masks."""
     stored = np.load(folder / "ground_truth" / "joints.npz")
     joints_m = stored["positions"][list(capture.frames)][:, LIMBS]
     true_px = np.stack(

@@ -226,12 +226,12 @@ class Attempt:
         return Prepared(recording, calibration, segmentation, body)
 
     def measure(self, prepared: Prepared, training: Artifact) -> Figures:
-        """Return the faults of surfaces, the scores of each image and the Chamfer distance of each surface that has
+        """Return the faults of surfaces, the scores of each image, and the Chamfer distance of each surface that has
         ground truth.
 
-        Scores are of novel poses, animated, or of training poses if the capture as recorded or the method has no novel
-        ones. Extreme poses have faults only. A degraded fit is used for training; novel poses are shown as in the good
-        fit.
+        Scores are of novel poses, animated, or of training poses if the capture as recorded, or the method, has no
+        novel ones. Extreme poses have only faults. A degraded fit is used for training only; novel poses are shown as
+        in the good fit.
         """
         no_poses = reason_without_novel_poses(training.root)
         if self.degradation and self.target == "poses":

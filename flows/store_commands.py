@@ -1,4 +1,4 @@
-"""What `hnerf store ...` does: a look into the store, and order in it; each docstring is the command's help."""
+"""The commands of `hnerf store`: inspect the store and clean it up. Each function's docstring is its command's help."""
 
 import argparse
 import re

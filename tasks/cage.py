@@ -175,7 +175,7 @@ class _Sender(logging.Handler):
 
 
 def _give_up_network() -> None:
-    """Give up the network for good, if the system allows that to a process, be it without rights or as root."""
+    """Give up network access for good, if the system lets this process do so, with or without root rights."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "unshare") and libc.unshare(CLONE_NEWNET):
         libc.unshare(CLONE_NEWUSER | CLONE_NEWNET)

@@ -103,7 +103,7 @@ class Inventory:
         for subject, links in self.latest.items():
             ended_early = "asset" not in links  # an unfinished run replaced the links of a finished one
             newest = [one.artifact for one in self.of_subject(subject)[::-1]] if keep > 1 or ended_early else []
-            assets = [one for one in newest if one.stage == "asset"][:keep]  # only complete runs end with one
+            assets = [one for one in newest if one.stage == "asset"][:keep]  # only a complete run ends with one
             trained = {name for one in assets for name in one.inputs if name.startswith("training/")}
             scores = [one for one in newest if one.stage == "evaluation" and trained & set(one.inputs)]
             roots |= {one.name for one in assets + scores}

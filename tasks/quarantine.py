@@ -1,4 +1,5 @@
-"""Why captures of a watched folder gave no result: <folder>/.refused/<name>.txt. The captures stay where they are."""
+"""Notes on why captures of a watched folder gave no result: <folder>/.refused/<name>.txt. The captures stay in
+place."""
 
 import os
 import time

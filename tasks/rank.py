@@ -1,4 +1,4 @@
-"""One of several processes, as started by the launcher under torchrun: python -m tasks.rank MODULE ARGUMENTS."""
+"""One of several processes that the launcher starts under torchrun: python -m tasks.rank MODULE ARGUMENTS."""
 
 import os
 import runpy

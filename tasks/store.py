@@ -96,8 +96,7 @@ class Store:
     root: Path
 
     def exists(self) -> bool:
-        """Return whether anything was ever stored here. A folder without any of these subfolders belongs to somebody
-        else."""
+        """Return whether anything was ever stored here. A folder without any of these subfolders is not a store."""
         return any((self.root / name).is_dir() for name in ("subjects", "ingested", STAGES[0]))
 
     def find(self, stage: str, key: str) -> Artifact | None:
@@ -314,7 +313,7 @@ class Store:
 
 
 def remove_checkpoint(folder: Path, name: str) -> None:
-    """Remove the files whose names begin with this from an artifact's folder, unless it is read-only."""
+    """Remove the files whose names begin with `name` from an artifact's folder, unless it is read-only."""
     for path in folder.glob(f"{name}*"):
         with unless_read_only():
             path.unlink(missing_ok=True)

@@ -30,8 +30,8 @@ def baked_textures(
     settings: AssetSettings,
     cavities: np.ndarray,
 ) -> tuple[np.ndarray, Albedo | None]:
-    """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, and its albedo; no albedo if the texture is the
-    field's alone.
+    """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, and its albedo, None if the texture is the field's
+    alone.
 
     surfaces_m (n, V, 3): the body's surface in the world in each frame; cavities (V,) bool: vertices deep inside mouth
     and nose, which are darkened because little light reaches them.

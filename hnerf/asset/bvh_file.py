@@ -14,7 +14,7 @@ RATE = RATES[-1]
 
 
 def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
-    """Write the captured motion of the game skeleton, from the pelvis down, at 30 frames a second, in centimetres, Y
+    """Write the captured motion of the game skeleton, from the pelvis down, at 30 frames per second, in centimetres, Y
     up."""
     rig = avatar.rigs[GAME]
     skeleton, stage = rig.skeleton, rig.stage[f"{CAPTURED}_{RATE}"][:, 1:]

@@ -51,7 +51,7 @@ def compare_with_field(
     capture: Capture, masks: Masks, avatar: Avatar, staged: StagedAvatar, splats: Splats | None = None
 ) -> list[Compared]:
     """Compare at most IMAGES views of training frames: from test cameras if the recording has masks for them, else from
-    training cameras. Return none if no view has a mask."""
+    training cameras. The list is empty if no view has a mask."""
     tested = [view for view in all_views(capture, NOVEL_VIEW) if capture.has_given_mask(view.camera, view.frame)]
     trained = [view for view in all_views(capture, TRAINING_VIEW) if (view.camera, view.frame) in masks]
     chosen = sample_views(tested or trained, IMAGES)

@@ -1,4 +1,4 @@
-"""A tangent-space normal map: the wrinkles of the field's surface that the mesh's faces are too large for."""
+"""A tangent-space normal map: the wrinkles of the field's surface that are too fine for the mesh's faces."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""How far the meshes of an asset stay from the surface of the field, by region of the body."""
+"""Distances of an asset's meshes from the surface of the field, by region of the body."""
 
 from collections.abc import Mapping
 

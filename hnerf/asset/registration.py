@@ -20,7 +20,7 @@ SMOOTHING_M = (0.06, 0.04, 0.028, 0.02, 0.014, 0.01, 0.007, 0.005)  # from a lim
 COSINES = 0.3, 0.7  # between the normals of matched points: from no trust to full trust
 FARTHEST_M = 0.06  # typical of hair and loose clothes; a match much farther away is no match
 LOOSEN_STEPS = 12
-LOOSEN_M = 0.0005  # by which faces that cross each other retreat into the body in a step
+LOOSEN_M = 0.0005  # step by which faces that cross each other retreat into the body
 LOOSEN_SMOOTHING_M = 0.002
 
 

@@ -13,7 +13,7 @@ from hnerf.evenly_spaced import evenly_spaced
 
 FULL, GAME = "full", "game"
 GAME_INFLUENCES = 4
-EYEBALL_WEIGHT = 0.99  # at least, of a point on an eyeball
+EYEBALL_WEIGHT = 0.99  # least weight of a point on an eyeball
 FITTED_FRAMES = 64  # at most, evenly spaced; more hardly change the weights
 
 
@@ -32,8 +32,8 @@ class RestSurface:
 
 @dataclass(frozen=True)
 class JointMotion:
-    """A motion of one skeleton. fps: of the time codes; codes (n,); translations_m (n, J, 3) and quaternions (n, J, 4)
-    as x y z w without sign jumps, relative to parents; shape_weights (n, K)."""
+    """A motion of one skeleton. fps: of the time codes; codes (n,): the time codes; translations_m (n, J, 3) and
+    quaternions (n, J, 4), as x y z w without sign jumps: relative to parents; shape_weights (n, K)."""
 
     fps: float
     codes: np.ndarray

@@ -1,4 +1,4 @@
-"""Splats as a PLY file, in the vertex layout of 3D Gaussian Splatting's own program, with a skin."""
+"""Splats as a PLY file, in the vertex layout of the published 3D Gaussian Splatting program, with a skin."""
 
 from pathlib import Path
 

@@ -75,9 +75,8 @@ def author_shape(stage: Usd.Stage, avatar: StagedAvatar, physique: str | None) -
 
 
 def physique_box(avatar: StagedAvatar, name: str) -> np.ndarray:
-    """Return a box (2, 3) that holds a physique in all motions: the captured body's, grown by the greatest displacement
-    of the physique. (Skinning moves no two points farther apart than at rest: weights are not negative and sum to
-    1.)"""
+    """Return a box (2, 3) that holds a physique in all motions: the captured body's box, grown by the greatest
+    displacement of the physique. (Skinning lengthens no displacement: its weights are not negative and sum to 1.)"""
     boxes, moved_m = np.concatenate(list(avatar.extents_m.values())), avatar.physiques_m[name]
     grown_m = np.linalg.norm(moved_m, axis=1).max()
     return np.stack([boxes[:, 0].min(0) - grown_m, boxes[:, 1].max(0) + grown_m])

@@ -162,7 +162,7 @@ def draw_curves(
 
 
 def draw_pareto_front(axes: Axes, points: Mapping[str, Point], method_styles: Mapping[str, Style]) -> None:
-    """Draw a mark per method and the Pareto front: points to the right of it and below are worse in both time and
+    """Draw a mark per method and the Pareto front: a point to the right of it and below is beaten in both time and
     accuracy. Draw nothing if there are no points."""
     if not points:
         return

@@ -19,7 +19,7 @@ PSNR, CHAMFER = "psnr", "geometry.chamfer_l2_e3"
 FIGURES = {PSNR: ("{} dB", 1, 1), CHAMFER: ("Chamfer {}", 3, -1)}
 # What a different seed may cost: decibels, and a factor on the squared distance (docs/findings.md).
 SEED_DB, SEED_RATIO = 0.4, 1.1
-WEAK = 0.5  # correlation below which there is no trend, by absolute value
+WEAK = 0.5  # absolute correlation below which there is no trend
 NO_SURFACE = 0.1  # IoU below which a mesh does not count as the person's surface
 
 
@@ -66,8 +66,8 @@ def loses_least(result: Result) -> Iterator[Finding]:
 
 
 def ahead(result: Result) -> Iterator[Finding]:
-    """Check that in every variant H-NeRF's scores are better than those of each other method. Where H-NeRF was run and
-    has no score, the claim is not supported."""
+    """Check that H-NeRF has better scores than each other method in every variant. If H-NeRF was run and has no score,
+    the claim is not supported."""
     for title, variant in result["variants"].items():
         for key, (_, _, sign) in FIGURES.items():
             values = {name: pick(scores[scores["split"]], key) for name, scores in scored_methods(variant).items()}
@@ -92,8 +92,8 @@ def falls_with_angle(result: Result) -> Iterator[Finding]:
 
 
 def ahead_at_every_angle(result: Result) -> Iterator[Finding]:
-    """Check that in every bin of angles H-NeRF is better than each other method. Where H-NeRF was run and has no
-    scores, the claim is not supported."""
+    """Check that H-NeRF is better than each other method in every bin of angles. If H-NeRF was run and has no scores,
+    the claim is not supported."""
     for title, by_method in _angles(result):
         for first in _h_nerf(result, result["variants"][title]["methods"]):
             for name in _others(result, by_method):
@@ -116,7 +116,7 @@ def no_trend_with_pose(result: Result) -> Iterator[Finding]:
 
 
 def others_have_no_surface(result: Result) -> Iterator[Finding]:
-    """Check that no method but H-NeRF has a surface that covers the person's volume."""
+    """Check that only H-NeRF has a surface that covers the person's volume."""
     for title, variant in result["variants"].items():
         scored = scored_methods(variant)
         for name in _others(result, scored):

@@ -147,8 +147,8 @@ def write_pictures(scene: ScoringScene, split: str, per_image: list[ImageScores]
 
 
 def add_training_distances(scene: ScoringScene, split: str, found: SplitScores) -> None:
-    """Add to the scores of each image and surface the distances of its view and its pose from those of training. They
-    are computed from the body as fitted, so that they are the same for all methods, however each has tuned the
+    """Add to the scores of each image and surface how far its view and its pose are from the training data. The
+    distances are computed from the body as fitted, so that they are the same for all methods, however each tunes the
     poses."""
     capture, body = scene.capture, scene.fitted
     apart_deg = pose_distances_deg(body, split_frames(capture, split), capture.train_frames)

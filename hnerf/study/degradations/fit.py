@@ -12,7 +12,7 @@ from hnerf.body.fit_result import BodyFit
 
 def add_pose_noise(body: BodyFit, angle_deg: float, rng: np.random.Generator) -> BodyFit:
     """Add random vectors to the rotation vectors of all free joints in all frames. `angle_deg` is the root mean square
-    of their lengths; for straight joints, it is that of the rotations, too."""
+    of their lengths and, for straight joints, of the rotations."""
     return dataclasses.replace(body, theta=body.theta + _rotation_noise(body, len(body.frames), angle_deg, rng))
 
 
