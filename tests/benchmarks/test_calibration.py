@@ -11,7 +11,7 @@ from hnerf.calibration.outline_adjustment import FRAMES
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.config import CalibrationSettings
 from tests.calibration.synthetic import detections, ring, turned, write_capture
-from tests.calibration.test_refine import OutlinesThat
+from tests.calibration.test_refine import OutlinesCosting
 
 
 def test_a_trial_refines_a_turned_camera_with_outlines_collected_once(
@@ -20,9 +20,9 @@ def test_a_trial_refines_a_turned_camera_with_outlines_collected_once(
     """The stage asks for outlines of few frames as evidence, and of FRAMES where a camera was refined."""
     whole, collected = write_capture(tmp_path, ring(4), detections(ring(4), 1)), []
 
-    def collect(capture: object, *frames: int) -> OutlinesThat:
+    def collect(capture: object, *frames: int) -> OutlinesCosting:
         collected.append((capture, *frames))
-        return OutlinesThat([], 0.0, 0.0)
+        return OutlinesCosting([], 0.0, 0.0)
 
     monkeypatch.setattr(Outlines, "of", collect)
     monkeypatch.setattr(Matches, "of", lambda _: Matches({}, 0))

@@ -1,4 +1,4 @@
-"""Synthetic captures: a ring of cameras around a walking stick figure, with everything known."""
+"""Synthetic captures: a ring of cameras around a walking stick figure, with all true values known."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -31,8 +31,8 @@ def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
 
 
 def ring(count: int) -> list[Camera]:
-    """Return cameras 3.5 m around the origin at 1.2 to 1.8 m height, unevenly spaced, looking at the middle of the
-    body."""
+    """Return cameras unevenly spaced on a circle of 3.5 m around the origin, 1.2 to 1.8 m high, looking at the middle
+    of the body."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False) + 0.3 * np.sin(np.arange(count))
     heights = 1.2 + 0.6 * (np.arange(count) % 2)
     return [
@@ -42,7 +42,7 @@ def ring(count: int) -> list[Camera]:
 
 
 def walk_m(frames: int = FRAMES) -> np.ndarray:
-    """Return joints (frames, 25, 3) of the figure on a small circle, turning, with swinging arms."""
+    """Return joints (frames, 25, 3) of the figure walking on a small circle, turning and swinging its arms."""
     poses = []
     for angle in np.linspace(0, 2 * np.pi, frames, endpoint=False):
         pose = STANDING_M.copy()
@@ -76,7 +76,7 @@ def write_capture(root: Path, cameras: list[Camera], seen: dict[str, np.ndarray]
 
 @contextmanager
 def edited_keypoints(root: Path) -> Iterator[dict[str, np.ndarray]]:
-    """Let the keypoints in a capture's folder be changed, by camera."""
+    """Yield the keypoints in a capture's folder by camera, and write them back as changed."""
     with np.load(root / "keypoints.npz") as stored:
         found = dict(stored)
     yield found

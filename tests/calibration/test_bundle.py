@@ -7,7 +7,7 @@ from hnerf.calibration.bundle import adjust, align
 from tests.calibration.synthetic import ring, turned, walk_m
 
 
-def test_a_rig_that_was_turned_scaled_and_moved_comes_back() -> None:
+def test_align_recovers_a_turned_scaled_and_moved_rig() -> None:
     """Points x become 2 Q x + m with a turn Q by 100 degrees, so cameras have R Q^T and stand at 2 Q c + m."""
     turn = cv2.Rodrigues(np.deg2rad(100) * np.array([0.6, 0, 0.8]))[0]
     moved = []
@@ -18,8 +18,8 @@ def test_a_rig_that_was_turned_scaled_and_moved_comes_back() -> None:
         np.testing.assert_allclose(back.projection, camera.projection, atol=1e-9)
 
 
-def test_a_camera_with_skew_comes_back() -> None:
-    """Exact keypoints of a camera whose x grows by 0.06 of y: a turn by half a degree is found, and nothing else."""
+def test_adjust_recovers_a_turned_camera_with_skew() -> None:
+    """With exact keypoints of a camera whose x grows by 0.06 y, only the turn of half a degree is corrected."""
     K = np.array([[1000.0, 60, 499.5], [0, 1000, 499.5], [0, 0, 1]])
     truth = [dataclasses.replace(camera, K=K) if camera.name == "c0" else camera for camera in ring(4)]
     seen = np.stack([camera.project(walk_m())[0] for camera in truth])

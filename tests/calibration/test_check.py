@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 def recorded_with(
     root: Path, mistake: Mistake, only: int | None = None, count: int = 4, noise_px: float = 2
 ) -> Capture:
-    """Return a ring that recorded the walk, with a mistake in the calibration of one camera or of all."""
+    """Return the walk as recorded by a ring of cameras, with a mistake in the calibration of one of them or of all."""
     cameras = ring(count)
     wrong = [mistake(camera) if only in (None, i) else camera for i, camera in enumerate(cameras)]
     return write_capture(root, wrong, detections(cameras, noise_px))
@@ -51,9 +51,9 @@ def test_body_height_by_hand() -> None:
     assert body_height_m(STANDING_M[None]) == pytest.approx((0.43 + 0.43 + 0.5 + np.hypot(0.05, 0.194)) / 0.87)
 
 
-def test_two_cameras_that_face_each_other_do_not_tell_how_far_off_what_lies_between_them_is() -> None:
-    """Nose and neck are on the line between them, 4 m from either, and 1 m above it, where their lines of sight cross
-    at 2 atan(1 / 4) = 28 degrees. A third camera, at right angles, sees the neck alone; then both."""
+def test_points_between_two_cameras_facing_each_other_have_no_depth() -> None:
+    """The nose is on the line between them, 4 m from either; the neck is 1 m above it, where their lines of sight cross
+    at 2 atan(1 / 4) = 28 degrees. A third camera, at right angles, first sees the neck alone, then both."""
     cameras = [
         dataclasses.replace(ring(1)[0], R=np.eye(3), t_m=-np.array(centre_m))
         for centre_m in ([4.0, 0, 1], [-4.0, 0, 1], [0, 4.0, 1])
@@ -69,8 +69,8 @@ def test_two_cameras_that_face_each_other_do_not_tell_how_far_off_what_lies_betw
     assert crossed_points(cameras, seen, points_m)[0, 0].tolist() == [0, 0, 1]
 
 
-def test_facing_cameras_are_not_taken_for_another_unit(tmp_path: Path) -> None:
-    """With errors of 8 px, the person of 1.79 m would be 1.97 m tall if the points between them were believed."""
+def test_cameras_facing_each_other_do_not_suggest_another_unit(tmp_path: Path) -> None:
+    """With errors of 8 px, the person of 1.79 m would be 1.97 m tall if the points between the cameras were used."""
     cameras = ring(2)
     report = check_calibration(write_capture(tmp_path, cameras, detections(cameras, 8)), SETTINGS)
     assert report.after is not None and report.after.body_height_m == pytest.approx(1.79, abs=0.1)
@@ -83,7 +83,7 @@ def test_units_by_hand() -> None:
     assert likely_unit(5) is None
 
 
-def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
+def test_a_good_calibration_is_left_unchanged(tmp_path: Path) -> None:
     capture = recorded_with(tmp_path / "in", lambda c: c)
     report = check_calibration(capture, SETTINGS)
     assert report.verdict == "ok"
@@ -96,8 +96,8 @@ def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
             np.testing.assert_array_equal(getattr(camera, field), getattr(capture.cameras[name], field))
 
 
-def test_a_world_that_does_not_stand_upright_is_told(tmp_path: Path) -> None:
-    """After a turn by a right angle about x, what pointed along z points along -y."""
+def test_a_world_that_is_not_upright_is_doubted(tmp_path: Path) -> None:
+    """After turning the world by a right angle about x, what pointed along z points along -y."""
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of the world: z to y
     fallen = [dataclasses.replace(camera, R=camera.R @ turn) for camera in ring(4)]
     capture = write_capture(tmp_path / "in", fallen, detections(ring(4), 2))
@@ -108,7 +108,7 @@ def test_a_world_that_does_not_stand_upright_is_told(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out" / "report.json").read_text())["doubts"] == [doubt]
 
 
-def test_keypoints_on_one_spot_are_refused(tmp_path: Path) -> None:
+def test_keypoints_all_at_one_point_are_refused(tmp_path: Path) -> None:
     cameras = ring(4)
     seen = detections(cameras, 2)
     seen["c1"][..., :2] = seen["c1"][:, :, :1, :2]
@@ -116,9 +116,9 @@ def test_keypoints_on_one_spot_are_refused(tmp_path: Path) -> None:
         check_calibration(write_capture(tmp_path, cameras, seen), SETTINGS)
 
 
-def test_runs_that_differ_in_the_last_digits_write_the_same_report(tmp_path: Path) -> None:
-    """Keypoints that differ by 1e-9 px stand for sums in another order. The artifact decides whether later stages are
-    found again, so that its camera files are the same, too."""
+def test_runs_that_differ_in_the_last_digits_write_the_same_files(tmp_path: Path) -> None:
+    """Keypoints that differ by 1e-9 px imitate sums taken in another order. The artifact's content decides whether
+    later stages can be reused, so its camera files must be the same, too."""
     written = []
     for name, nudge_px in (("one", 0.0), ("two", 1e-9)):
         turned_camera = [turned(camera, 1.0) if i == 2 else camera for i, camera in enumerate(ring(3))]
@@ -130,8 +130,8 @@ def test_runs_that_differ_in_the_last_digits_write_the_same_report(tmp_path: Pat
     assert written[0] == written[1] and '"verdict": "refined"' in written[0][0]
 
 
-def test_without_legs_the_height_is_not_known(tmp_path: Path) -> None:
-    """JSON has no NaN: the height is null, which every reader accepts."""
+def test_without_legs_the_stored_height_is_null(tmp_path: Path) -> None:
+    """JSON has no NaN; every reader accepts null."""
     cameras = ring(4)
     seen = detections(cameras, 2)
     for points in seen.values():
@@ -142,8 +142,8 @@ def test_without_legs_the_height_is_not_known(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("noise_px", "status"), [(10, "suspect"), (20, "rejected")])
-def test_a_camera_of_bad_detections_is_suspect_then_rejected(tmp_path: Path, noise_px: float, status: str) -> None:
-    """No calibration explains bad detections: a usable camera is used and marked, another is left out."""
+def test_a_camera_with_bad_detections_is_suspect_or_rejected(tmp_path: Path, noise_px: float, status: str) -> None:
+    """No calibration explains bad detections: a camera that is still usable is kept and marked, others are left out."""
     cameras = ring(4)
     seen = detections(cameras, 2) | {"c2": detections(cameras, noise_px, seed=1)["c2"]}
     capture = write_capture(tmp_path / "in", cameras, seen)
@@ -154,8 +154,8 @@ def test_a_camera_of_bad_detections_is_suspect_then_rejected(tmp_path: Path, noi
     assert ("c2" in used.cameras) == ("c2" in used.train_cameras) == (status == "suspect")
 
 
-def test_cameras_of_any_name_are_read_back(tmp_path: Path) -> None:
-    """Recordings may use any camera name, but OpenCV's own writer refuses brackets and blanks."""
+def test_cameras_with_any_name_are_read_back(tmp_path: Path) -> None:
+    """Recordings may use any camera name, but OpenCV's own writer refuses brackets and spaces."""
     cameras = [dataclasses.replace(camera, name=f"Camera ({i})") for i, camera in enumerate(ring(4))]
     capture = write_capture(tmp_path / "in", cameras, detections(cameras, 2))
     check_calibration(capture, SETTINGS).save(tmp_path / "out")
@@ -191,33 +191,33 @@ def test_one_turned_camera_is_named_and_refined(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("zoom", "lens"), [(1.0, ""), (1.01, ", focal length changed by +1.0 %")])
-def test_a_focal_length_that_only_lost_digits_has_not_changed(zoom: float, lens: str) -> None:
-    """Refined cameras have K to 1e-4 px, and a calibration may have given 1000.00003."""
+def test_rounding_is_not_reported_as_a_change_of_focal_length(zoom: float, lens: str) -> None:
+    """Refined cameras have K rounded to 1e-4 px, and a calibration may have given 1000.00003."""
     given = dataclasses.replace(ring(1)[0], K=np.array([[1000.00003, 0, 499.5], [0, 1000, 499.5], [0, 0, 1]]))
     new = _rounded(zoomed(turned(given, 1.0), zoom))
     assert _change_reasons(given, new) == [f"turned by 1.00 degrees, moved by 0.0 cm{lens}"]
 
 
-def test_far_off_camera_comes_back(tmp_path: Path) -> None:
+def test_a_camera_turned_by_ten_degrees_is_recovered(tmp_path: Path) -> None:
     report = check_calibration(recorded_with(tmp_path, lambda c: turned(c, 10.0), only=1), SETTINGS)
     assert true_error_px(report.cameras["c1"], ring(4)[1]) < 1
 
 
-def test_when_all_are_stale_the_world_stays(tmp_path: Path) -> None:
+def test_when_all_cameras_are_refined_the_world_stays_in_place(tmp_path: Path) -> None:
     signs = iter([1, -1, 1, -1])
     capture = recorded_with(tmp_path, lambda c: turned(c, 0.8 * next(signs), axis=0), noise_px=1)
     report = check_calibration(capture, SETTINGS)
     assert {v.status for v in report.verdicts.values()} == {"refined"}
     assert report.after is not None
     assert max(report.after.median_px.values()) < 2
-    # Nobody can tell where the whole rig moved; as the errors cancel, points must be where they were within 2 cm.
+    # A motion of the whole rig cannot be known; as the errors cancel, points must stay within 2 cm.
     points_m = report.after.points_m
     assert np.median(np.linalg.norm(points_m - walk_m(), axis=-1)) < 0.02
 
 
 @pytest.mark.parametrize("cause", list(MISTAKES))
 def test_each_wrong_convention_is_named(tmp_path: Path, cause: str) -> None:
-    make: dict[str, Mistake] = dict(MISTAKES)  # all but one undo themselves
+    make: dict[str, Mistake] = dict(MISTAKES)  # all but one are their own inverse
     make["T is the camera's centre"] = lambda c: dataclasses.replace(c, t_m=c.centre_m)
     with pytest.raises(InputError) as caught:
         check_calibration(recorded_with(tmp_path, make[cause]), SETTINGS)
@@ -228,7 +228,7 @@ def test_each_wrong_convention_is_named(tmp_path: Path, cause: str) -> None:
 
 @pytest.mark.parametrize("count", [3, 4])
 @pytest.mark.parametrize("ratio", [0.25, 0.64, 1.5, 2])
-def test_intrinsics_of_another_picture_size_are_named(tmp_path: Path, count: int, ratio: float) -> None:
+def test_intrinsics_for_another_image_size_are_named(tmp_path: Path, count: int, ratio: float) -> None:
     """The image size is blamed, not the unit, although the person would be 0.4 to 8.5 m tall."""
     wrong = recorded_with(tmp_path, lambda c: dataclasses.replace(c, K=np.diag([ratio, ratio, 1]) @ c.K), count=count)
     with pytest.raises(InputError, match=r"images of different sizes \(K times [0-9.]+ would fit\)") as caught:
@@ -237,7 +237,7 @@ def test_intrinsics_of_another_picture_size_are_named(tmp_path: Path, count: int
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_a_camera_that_is_far_off_is_not_one_of_another_picture_size(count: int) -> None:
+def test_a_camera_that_is_far_off_does_not_suggest_another_image_size(count: int) -> None:
     """With two cameras, scaling K by 0.74 would fit as well."""
     cameras = ring(count)
     seen = np.stack([points[:, 0] for points in detections(cameras, 2).values()])
@@ -245,9 +245,9 @@ def test_a_camera_that_is_far_off_is_not_one_of_another_picture_size(count: int)
     assert size_ratio(cameras, seen) is None
 
 
-def test_the_corner_of_a_small_picture_stays_its_corner_at_another_size() -> None:
-    """A person 31 px tall, where keypoints may be off by 1.6 px: scaled about the centre of the first pixel, pictures
-    of 5 times the size would be off by (5 - 1) / 2 = 2 px."""
+def test_images_of_another_size_are_scaled_about_their_corner() -> None:
+    """For a person 31 px tall, keypoints may be off by 1.6 px. If images 5 times as large were scaled about the centre
+    of the first pixel instead, keypoints would be off by (5 - 1) / 2 = 2 px."""
     cameras = [camera.resized(14, 14) for camera in ring(3)]
     seen = detections([camera.resized(70, 70) for camera in cameras], 0)
     assert size_ratio(cameras, np.stack([points[:2, 0] for points in seen.values()])) == pytest.approx(5)
@@ -269,7 +269,7 @@ def test_a_wrong_convention_in_one_camera_is_named(tmp_path: Path) -> None:
     ],
     ids=["millimetres", "metres for millimetres", "principal point, which no unit explains", "cameras at one place"],
 )
-def test_what_no_person_can_have_is_named(
+def test_an_impossible_setup_is_named(
     tmp_path: Path, changed: Callable[[Camera], dict[str, np.ndarray]], only: int | None, message: str
 ) -> None:
     wrong = recorded_with(tmp_path, lambda c: dataclasses.replace(c, **changed(c)), only, noise_px=0)
@@ -277,7 +277,7 @@ def test_what_no_person_can_have_is_named(
         check_calibration(wrong, SETTINGS)
 
 
-def test_a_person_of_unusual_height_is_told_not_refused(tmp_path: Path) -> None:
+def test_an_unusual_height_is_noted_not_refused(tmp_path: Path) -> None:
     small = recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=0.6 * c.t_m), noise_px=0)
     (note,) = check_calibration(small, SETTINGS).notes
     # 0.6 of the figure's 1.793 m; 1.7 / 1.076 = 1.58.
@@ -285,7 +285,7 @@ def test_a_person_of_unusual_height_is_told_not_refused(tmp_path: Path) -> None:
     assert float(note.split()[-1]) == pytest.approx(1.58, abs=0.01)
 
 
-def test_swapped_files_fit_no_convention(tmp_path: Path) -> None:
+def test_swapped_camera_files_are_explained_by_no_known_mistake(tmp_path: Path) -> None:
     cameras = ring(4)
     shuffled = [
         dataclasses.replace(cameras[1], name="c0"), dataclasses.replace(cameras[0], name="c1"), *cameras[2:]
@@ -308,7 +308,7 @@ def test_a_camera_that_never_shows_the_person_is_left_out_if_two_others_do(tmp_p
         check_calibration(dataclasses.replace(capture, train_cameras=("c1", "c2")), SETTINGS)
 
 
-def test_a_size_mismatch_is_named(tmp_path: Path) -> None:
+def test_an_image_size_mismatch_is_named(tmp_path: Path) -> None:
     capture = recorded_with(tmp_path, lambda c: c)
     capture = dataclasses.replace(capture, calibrated_sizes_px=capture.calibrated_sizes_px | {"c1": (1008, 1000)})
     report = check_calibration(capture, SETTINGS)
@@ -316,7 +316,7 @@ def test_a_size_mismatch_is_named(tmp_path: Path) -> None:
     assert report.verdicts["c1"].status == "ok"
 
 
-def test_one_camera_says_what_is_not_checked(tmp_path: Path) -> None:
+def test_with_one_camera_the_report_names_what_is_not_checked(tmp_path: Path) -> None:
     capture = recorded_with(tmp_path / "in", lambda c: c, count=1)
     report = check_calibration(capture, SETTINGS)
     assert report.verdict == "ok"
@@ -325,14 +325,14 @@ def test_one_camera_says_what_is_not_checked(tmp_path: Path) -> None:
     assert load_cameras(tmp_path / "out", capture).train_cameras == ("c0",)
 
 
-def test_a_rendered_capture_is_left_alone(wave: Capture) -> None:
+def test_a_rendered_capture_is_left_unchanged(wave: Capture) -> None:
     report = check_calibration(wave, SETTINGS)
     assert report.verdict == "ok"
     assert all(report.cameras[name] is camera for name, camera in wave.cameras.items())
 
 
 def test_the_trimmed_cost_uses_every_view() -> None:
-    """One camera looks backwards. Rejected, it would cost its image's diagonal, the others nothing: 354 px in all."""
+    """One camera looks backwards. If it were rejected, the cost would be its image's diagonal alone: 354 px in all."""
     cameras = ring(4)
     keypoints = np.stack([found[:, 0] for found in detections(cameras, 0).values()]).reshape(4, -1, 3)
     assert trimmed_cost_px(cameras, keypoints) == pytest.approx(0, abs=1e-6)
@@ -340,9 +340,9 @@ def test_the_trimmed_cost_uses_every_view() -> None:
     assert trimmed_cost_px(backwards, keypoints) > 400
 
 
-def test_no_camera_is_trimmed_away_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five cameras are 1 to 10 px off, 4.5 px in the mean of the lowest eight, and one is 100: (5 x 4.5 + 100) / 6. Of
-    all 60 errors, the lowest four fifths are without that camera's."""
+def test_trimming_the_cost_does_not_drop_a_whole_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five cameras are 1 to 10 px off, with a mean of 4.5 px over the lowest eight errors, and one is 100 px off:
+    (5 x 4.5 + 100) / 6. The lowest four fifths of all 60 errors together would leave that camera out."""
     cameras, off_px = ring(6), np.stack([*[np.arange(1.0, 11)] * 5, np.full(10, 100.0)])
     keypoints = np.stack([found[:2, 0, :5].reshape(10, 3) for found in detections(cameras, 0).values()])
     monkeypatch.setattr("hnerf.calibration.diagnosis.reprojection_px", lambda *_: off_px)

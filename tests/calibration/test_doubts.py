@@ -1,4 +1,4 @@
-"""What all cameras agree on and still is wrong: sides, mirrored pictures."""
+"""Errors that all cameras agree on: exchanged sides, mirrored images."""
 
 import dataclasses
 from pathlib import Path
@@ -10,7 +10,7 @@ from hnerf.capture.capture import Capture, write_image
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import FRAMES, SIZE_PX, detections, edited_keypoints, ring, walk_m, write_capture
 
-# BODY_25: each right keypoint and its left one
+# BODY_25: each right keypoint with its left counterpart
 PAIRS = ((2, 5), (3, 6), (4, 7), (9, 12), (10, 13), (11, 14), (15, 16), (17, 18), (22, 19), (23, 20), (24, 21))
 
 
@@ -22,14 +22,14 @@ def exchanged(points: np.ndarray) -> np.ndarray:
     return points[..., order, :]
 
 
-def test_exchanged_sides_are_told_by_face_and_feet() -> None:
-    """The figure faces +x with its left at +y, and turns on."""
+def test_exchanged_sides_are_detected_by_face_and_feet() -> None:
+    """The figure starts facing +x, with its left side towards +y, and keeps turning."""
     assert exchanged_sides(walk_m()) == []
     (doubt,) = exchanged_sides(exchanged(walk_m()))
     assert doubt.startswith("left and right are exchanged")
 
 
-def test_the_face_or_the_feet_are_enough_and_neither_is_no_doubt() -> None:
+def test_face_or_feet_suffice_to_detect_exchanged_sides() -> None:
     face, feet, neither = (exchanged(walk_m()) for _ in range(3))
     face[:, 19:] = np.nan
     feet[:, [0, 17, 18]] = np.nan
@@ -38,9 +38,9 @@ def test_the_face_or_the_feet_are_enough_and_neither_is_no_doubt() -> None:
     assert exchanged_sides(neither) == []
 
 
-def test_what_lies_between_two_cameras_that_face_each_other_tells_no_sides(tmp_path: Path) -> None:
-    """From 50 m on either side, lines of sight cross at less than three degrees; a third camera, at the right angle,
-    tells."""
+def test_two_cameras_facing_each_other_cannot_detect_exchanged_sides(tmp_path: Path) -> None:
+    """From 50 m on either side, lines of sight cross at less than three degrees; a third camera, at a right angle,
+    reveals the exchange."""
     centres_m = ([50.0, 0, 0.9], [-50.0, 0, 0.9], [0, 50.0, 0.9])
     cameras = [dataclasses.replace(c, t_m=-c.R @ np.array(m)) for c, m in zip(ring(3), centres_m, strict=True)]
     seen = detections(cameras, 1)
@@ -66,7 +66,7 @@ def with_masks(root: Path) -> tuple[Capture, np.ndarray]:
     return dataclasses.replace(capture, root=root), np.stack([people[:, 0] for people in seen.values()])
 
 
-def test_keypoints_of_mirrored_pictures_are_told_by_masks(tmp_path: Path) -> None:
+def test_masks_reveal_keypoints_of_mirrored_images(tmp_path: Path) -> None:
     capture, keypoints = with_masks(tmp_path)
     assert of_other_pictures(capture, keypoints) == []
     wrong = keypoints.copy()
@@ -75,8 +75,8 @@ def test_keypoints_of_mirrored_pictures_are_told_by_masks(tmp_path: Path) -> Non
     assert "mirrored left to right 100%" in doubt
 
 
-def test_inverted_masks_are_no_mirrored_pictures(tmp_path: Path) -> None:
-    """Keypoints at the left of all pictures lie on no inverted mask there, and on all at the right."""
+def test_inverted_masks_are_not_taken_for_mirrored_images(tmp_path: Path) -> None:
+    """Keypoints at the left of every image lie outside its inverted mask; mirrored to the right, they lie inside it."""
     capture, keypoints = with_masks(tmp_path)
     keypoints[..., 0] = SIZE_PX / 8
     for path in (tmp_path / "masks").glob("*/*.png"):
@@ -86,7 +86,7 @@ def test_inverted_masks_are_no_mirrored_pictures(tmp_path: Path) -> None:
     assert of_other_pictures(capture, keypoints) == []
 
 
-def test_pictures_of_one_camera_that_are_not_its_own_are_told_by_masks(tmp_path: Path) -> None:
+def test_masks_reveal_keypoints_that_do_not_belong_to_the_images_of_one_camera(tmp_path: Path) -> None:
     capture, keypoints = with_masks(tmp_path)
     first, mirrored = capture.train_cameras[0], keypoints.copy()
     mirrored[0, ..., 0] = SIZE_PX - 1 - mirrored[0, ..., 0]
@@ -102,7 +102,7 @@ def test_pictures_of_one_camera_that_are_not_its_own_are_told_by_masks(tmp_path:
     assert doubt.startswith(f"camera {first}: 0% ") and "in other cameras 100%" in doubt
 
 
-def test_masks_that_are_loose_or_hold_half_the_person_are_no_doubt(tmp_path: Path) -> None:
+def test_masks_that_are_loose_or_show_half_the_person_raise_no_doubt(tmp_path: Path) -> None:
     capture, keypoints = with_masks(tmp_path)
     for frame, people in enumerate(keypoints[0]):
         middle_px = int(people[8, 1])
@@ -118,14 +118,14 @@ def test_without_masks_or_plates_there_is_no_doubt(tmp_path: Path) -> None:
 
 
 def with_a_test_camera(root: Path, wrong: Camera, detected: bool) -> Capture:
-    """Write a capture of three cameras, and one for testing that is calibrated as `wrong`."""
+    """Write a capture of three training cameras and a test camera that is calibrated as `wrong`."""
     *others, test = ring(4)
     seen = detections([*others, test] if detected else others, 1)
     capture = write_capture(root, [*others, dataclasses.replace(wrong, name=test.name)], seen)
     return dataclasses.replace(capture, train_cameras=capture.train_cameras[:3], test_cameras=(test.name,))
 
 
-def test_a_test_camera_that_is_calibrated_wrongly_is_doubted(tmp_path: Path) -> None:
+def test_a_wrongly_calibrated_test_camera_is_doubted(tmp_path: Path) -> None:
     """Without keypoints of its own, it is doubted if it cannot see the person."""
     first, *_, test = ring(4)
     millimetres = dataclasses.replace(test, t_m=1000 * test.t_m)
@@ -142,7 +142,7 @@ def test_a_test_camera_that_is_calibrated_wrongly_is_doubted(tmp_path: Path) -> 
         assert all(line.startswith("camera c3, for testing: ") for line in lines)
 
 
-def test_a_test_camera_may_see_somebody_else_as_well_or_nobody(tmp_path: Path) -> None:
+def test_a_test_camera_may_also_see_somebody_else_or_nobody(tmp_path: Path) -> None:
     capture = with_a_test_camera(tmp_path, ring(4)[3], detected=True)
     points_m = walk_m()
     points_m[0] = points_m[:, 3] = np.nan

@@ -1,4 +1,4 @@
-"""All three kinds of evidence on a rendered capture with a spoilt calibration."""
+"""All three kinds of evidence, on a rendered capture with a damaged calibration."""
 
 import dataclasses
 import json
@@ -21,7 +21,9 @@ from hnerf.config import CalibrationSettings
 from tests.calibration.synthetic import turned
 
 
-def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evidence_before_and_after_refining_a_turned_camera(
+    wave: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("hnerf.calibration.refine.FRAMES", 4)
     monkeypatch.setattr("hnerf.calibration.outline_adjustment.EVALUATIONS", 6)
     monkeypatch.setattr("hnerf.calibration.silhouettes.POINTS", 32)
@@ -32,7 +34,7 @@ def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path, monkeyp
     given, used = stored["witnesses"]["as_given"], stored["witnesses"]["as_used"]
     assert set(given) == set(used) == {"keypoints", "silhouettes", "matches", "match_pairs"}
     assert given["keypoints"]["02"]["median_px"] > used["keypoints"]["02"]["median_px"] + 1
-    # Two degrees at a focal length of 249 px are 8.7 px; the mean is over rays of which most cannot miss.
+    # Two degrees at a focal length of 249 px are 8.7 px; most rays in the mean cannot miss.
     means_px = [sum(said["silhouettes"][name]["mean_px"] for name in wave.train_cameras) for said in (given, used)]
     assert means_px[0] > 2 and means_px[1] < 0.5
     assert used["matches"]["02"] == {"count": 0, "reason": "no overlap: no matches"}
@@ -42,8 +44,8 @@ def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path, monkeyp
     assert load_cameras(tmp_path, off).train_cameras == wave.train_cameras
 
 
-def test_matches_of_a_pair_speak_for_both_cameras(wave: Capture, tmp_path: Path) -> None:
-    # One point of the world, 3 px too low in the first camera: up to 3 px, shared between both images.
+def test_matches_of_a_pair_count_for_both_cameras(wave: Capture, tmp_path: Path) -> None:
+    # One point in the world, 3 px too low in the first camera: a residual of up to 3 px, shared between both images.
     cameras = [wave.cameras[name] for name in wave.train_cameras]
     keypoints = ranked_people(wave)[0].keypoints
     point_m = np.array([[0.1, 0.2, 1.0]])
@@ -59,10 +61,10 @@ def test_matches_of_a_pair_speak_for_both_cameras(wave: Capture, tmp_path: Path)
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
 
 
-def test_the_sheet_asks_for_outlines_as_often_for_many_cameras_and_draws_none_that_has_no_other(
+def test_the_sheet_computes_outline_residuals_twice_and_draws_no_outline_seen_by_one_camera_only(
     wave: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the middle of the instants, which is shown, only one camera has an outline: nothing says how far it is off."""
+    """At the middle instant, which is drawn, only one camera has an outline, so its residuals are unknown."""
     cameras = [wave.cameras[name] for name in wave.train_cameras]
     keypoints = ranked_people(wave)[0].keypoints
     disc = np.zeros(cameras[0].size_px[::-1], np.uint8)
@@ -78,14 +80,14 @@ def test_the_sheet_asks_for_outlines_as_often_for_many_cameras_and_draws_none_th
     assert len(asked) == 2
 
 
-def test_without_masks_the_report_says_so(wave: Capture) -> None:
+def test_the_report_says_that_there_are_no_masks(wave: Capture) -> None:
     cameras = [wave.cameras[name] for name in wave.train_cameras]
     keypoints = ranked_people(wave)[0].keypoints
     said = Evidence(wave, keypoints, None, Matches({}, 0), None).summarise(cameras, measure(cameras, keypoints))
     assert said["silhouettes"].startswith("none: ") and said["match_pairs"] == "no overlap: no matches"
 
 
-def test_one_camera_is_judged_by_the_ground(wave: Capture) -> None:
+def test_a_single_camera_is_judged_by_the_ground(wave: Capture) -> None:
     report = check_calibration(dataclasses.replace(wave, train_cameras=("01",)), CalibrationSettings())
     assert report.evidence is None
     assert any("standing on world height 0 the person is 1.7" in r for r in report.verdicts["01"].reasons)

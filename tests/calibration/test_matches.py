@@ -18,7 +18,7 @@ def pair() -> tuple[Camera, Camera]:
 
 
 def seen(count: int = 200) -> np.ndarray:
-    """Return points (n, 2, 2) of a cube of 2 m in both cameras."""
+    """Return points (n, 2, 2) in a cube of 2 m as both cameras see them."""
     points_m = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 2], (count, 3))
     return np.stack([camera.project(points_m)[0] for camera in pair()], 1)
 
@@ -30,14 +30,14 @@ def test_sampson_by_hand() -> None:
     assert sampson_px(F, np.array([[[5.0, 7], [9, 7]], [[5, 7], [9, 9]]])) == pytest.approx([0, np.sqrt(2)])
 
 
-def test_true_cameras_agree_and_a_turned_one_shows() -> None:
+def test_matches_agree_with_true_cameras_but_not_with_a_turned_one() -> None:
     a, b = pair()
     assert sampson_px(fundamental(a, b), seen()).max() < 1e-8
-    # Pitched by one degree, 17.5 px along y at the middle: half in each image's share is 17.5 / sqrt 2 = 12.3.
+    # A pitch of one degree is 17.5 px along y at the middle; shared between both images, 17.5 / sqrt 2 = 12.3.
     assert np.median(sampson_px(fundamental(a, turned(b, 1.0, axis=0)), seen())) == pytest.approx(12.3, abs=1)
 
 
-def test_verification_does_not_ask_the_calibration() -> None:
+def test_matches_are_verified_without_the_calibration() -> None:
     wrong = np.random.default_rng(1).uniform(0, 1000, (60, 2, 2))
     kept = _verified_matches(np.concatenate([seen(), wrong]))
     assert 200 <= len(kept) < 210
@@ -45,8 +45,8 @@ def test_verification_does_not_ask_the_calibration() -> None:
     assert len(_verified_matches(seen(10))) == 0
 
 
-def test_matches_have_pixel_centres_at_integers() -> None:
-    """COLMAP's corner of an image is at 0, so that its first pixel's centre is at one half."""
+def test_matches_use_integer_pixel_centres() -> None:
+    """COLMAP puts the corner of an image at 0, and the centre of the first pixel at one half."""
     a, b = ([SimpleNamespace(x=x + 0.5, y=7.5) for x in places] for places in ((3, 9), (20, 21, 22)))
     matcher: Any = SimpleNamespace(match=lambda *_: [(1, 2), (0, 0)])
     found: Any = (a, None), (b, None)

@@ -17,7 +17,7 @@ def standing() -> np.ndarray:
     return detections(ring(1), noise_px=0)["c0"][:, 0]
 
 
-def test_usual_intrinsics_have_no_reasons() -> None:
+def test_plausible_intrinsics_give_no_reasons() -> None:
     assert intrinsics_reasons(ring(1)[0]) == []  # 1000 px wide at 1000 px focal length: 53 degrees
 
 
@@ -27,7 +27,7 @@ def test_usual_intrinsics_have_no_reasons() -> None:
         # 1000 px at 200 px focal length: 2 atan 2.5 = 136 degrees; at 8000 px: 7 degrees.
         ([[200, 0, 499.5], [0, 200, 499.5], [0, 0, 1]], "field of view 136 degrees"),
         ([[8000, 0, 499.5], [0, 8000, 499.5], [0, 0, 1]], "field of view 7 degrees"),
-        # The middle of a picture of 1920 x 1080.
+        # The middle of an image of 1920 x 1080.
         (
             [[1000, 0, 959.5], [0, 1000, 539.5], [0, 0, 1]],
             "principal point at 96 % of the width and 54 % of the height",
@@ -35,7 +35,7 @@ def test_usual_intrinsics_have_no_reasons() -> None:
         ([[1000, 0, 499.5], [0, 1250, 499.5], [0, 0, 1]], "pixels 1.25 times as wide as high"),
     ],
 )
-def test_odd_intrinsics_are_named(K: list, words: str) -> None:
+def test_implausible_intrinsics_are_named(K: list, words: str) -> None:
     reasons = intrinsics_reasons(dataclasses.replace(ring(1)[0], K=np.array(K, float)))
     assert len(reasons) == 1 and words in reasons[0]
 
@@ -46,8 +46,8 @@ def test_stature_by_hand() -> None:
     assert stature_on_ground_m(camera, standing(), "z") == pytest.approx(STANDING_M[0, 2] / 0.92, abs=0.08)
 
 
-def test_ankles_tell_the_stature_where_no_sole_is_seen() -> None:
-    """Someone of 2 m is seen from 4 m away: the ankles at 0.039 x 2 m, the nose at 0.92 x 2 m."""
+def test_ankles_give_the_stature_if_no_foot_is_seen() -> None:
+    """A person 2 m tall is seen from 4 m away: the ankles at a height of 0.039 x 2 m, the nose at 0.92 x 2 m."""
     camera = look_at("0", np.array([4.0, 0, 1.0]), target_m=np.array([0, 0, 1.0]))
     points_m = np.array([[0, 0, 1.84], [0, 0.1, 0.078], [0, -0.1, 0.078]])
     seen = np.zeros((1, 25, 3))
@@ -56,8 +56,8 @@ def test_ankles_tell_the_stature_where_no_sole_is_seen() -> None:
     assert raised_above_ground(camera, seen, "z", 2.0) == (camera, "")
 
 
-def test_a_known_stature_decides_what_height_0_can_be() -> None:
-    """The figure measures 1.78 m: no child's, whose 1.34 m it is 1.33 times of."""
+def test_a_known_stature_decides_whether_height_0_is_the_ground() -> None:
+    """The figure measures 1.78 m, 1.33 times the 1.34 m of a child."""
     camera = ring(1)[0]
     assert "not 1.34 m: height 0 is not the ground" in ground_reasons(camera, standing(), "z", 1.34)[0]
     assert "can be true" in ground_reasons(camera, standing(), "z", 1.8)[0]
@@ -68,14 +68,14 @@ def test_a_known_stature_decides_what_height_0_can_be() -> None:
 def test_a_wrong_ground_or_scale_is_flagged() -> None:
     camera = ring(1)[0]
     assert "can be true" in ground_reasons(camera, standing(), "z", None)[0]
-    doubled = dataclasses.replace(camera, t_m=2 * camera.t_m)  # everything twice as far, so twice as tall
+    doubled = dataclasses.replace(camera, t_m=2 * camera.t_m)  # the camera twice as far, so the person twice as tall
     assert "would be 3.5" in ground_reasons(doubled, standing(), "z", None)[0]
     below = dataclasses.replace(camera, t_m=camera.t_m + camera.R @ [0, 0, 2.0])  # the camera two metres down
     assert "cannot be checked" in ground_reasons(below, standing(), "z", None)[0]
 
 
-def test_a_camera_of_unknown_height_is_raised_above_a_person_of_known_stature() -> None:
-    """The ring's camera is moved down to height 0, and comes back to where it was; what was measured stays."""
+def test_a_camera_of_unknown_height_is_placed_by_a_known_stature() -> None:
+    """A camera of the ring that is moved down to height 0 returns to its height; one whose height is known stays."""
     camera = ring(1)[0]
     vertical, height_m = np.array([0, 0, 1.0]), camera.centre_m[2]
     lowered = dataclasses.replace(camera, t_m=camera.t_m + camera.R @ vertical * height_m)
@@ -84,7 +84,7 @@ def test_a_camera_of_unknown_height_is_raised_above_a_person_of_known_stature() 
     assert words.startswith(f"its height is not known: {height_m:.2f} m if")
     assert raised_above_ground(camera, standing(), "z", 1.7) == (camera, "")
     head_first = standing()
-    head_first[:, 0, 1] = head_first[:, [19, 21, 22, 24], 1].max(1) + 100  # would stand below the ground
+    head_first[:, 0, 1] = head_first[:, [19, 21, 22, 24], 1].max(1) + 100  # this would put the camera below the ground
     assert raised_above_ground(lowered, head_first, "z", 1.7)[0] is lowered
 
 

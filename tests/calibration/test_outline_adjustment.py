@@ -1,4 +1,4 @@
-"""Cameras fitted to the exact outlines of a box in several places."""
+"""Cameras fitted to the exact outlines of a box that stands in several places."""
 
 from functools import cache
 from pathlib import Path
@@ -37,7 +37,7 @@ def outlines(range_m: float = 0.1) -> Outlines:
 
 
 def off_px(cameras: list[Camera]) -> np.ndarray:
-    """Return the mean distance of the boxes' corners in each image from where they are seen, (C,)."""
+    """Return the mean distance (C,) of the boxes' corners in each image from where the true camera sees them."""
     corners_m = np.concatenate(places())
     pairs = zip(cameras, ring(4), strict=True)
     return np.array(
@@ -46,8 +46,8 @@ def off_px(cameras: list[Camera]) -> np.ndarray:
 
 
 def test_a_camera_turns_about_the_person_and_moves_in_its_own_axes() -> None:
-    """A quarter turn about the line of sight leaves the pivot in its pixel; 1 cm to the right, 3.5 m away, is 1000 x
-    0.01 / 3.5 pixels."""
+    """A quarter turn about the line of sight leaves the pivot at its pixel; a move by 1 cm to the right, 3.5 m away,
+    shifts it by 1000 x 0.01 / 3.5 pixels."""
     camera = ring(4)[1]
     seen, depth_m = camera.project(MIDDLE_M)
     quarter = _turned(camera, np.array([0, 0, np.pi / 2, 0, 0, 0]), MIDDLE_M)
@@ -57,14 +57,14 @@ def test_a_camera_turns_about_the_person_and_moves_in_its_own_axes() -> None:
     np.testing.assert_allclose(moved.project(MIDDLE_M)[0] - seen, [camera.K[0, 0] * 0.01 / depth_m, 0], atol=1e-9)
 
 
-def test_a_turned_camera_returns() -> None:
+def test_outlines_recover_a_turned_camera() -> None:
     given = with_c2(lambda c: turned(c, 0.5))
     found = adjust_to_outlines(outlines(), given, ["c2"], MIDDLE_M)
     assert [new is old for new, old in zip(found, given, strict=True)] == [True, True, False, True]
     assert off_px(given)[2] > 8 and off_px(found)[2] < 1
 
 
-def test_all_cameras_together_keep_the_world() -> None:
+def test_fitting_all_cameras_keeps_the_world_in_place() -> None:
     given = with_c2(lambda c: turned(c, 0.5))
     found = adjust_to_outlines(outlines(), given, [c.name for c in given], MIDDLE_M)
     assert off_px(found).max() < off_px(given).max() / 2
@@ -74,11 +74,11 @@ def test_all_cameras_together_keep_the_world() -> None:
     np.testing.assert_allclose(moved_m, 0, atol=1e-9)
 
 
-def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(
+def test_outlines_correct_keypoint_errors_that_are_the_same_in_all_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """c2 is turned by a degree, and its detector sees everything 4 px to the right: keypoints alone leave it 4 px off.
-    Without any error of keypoints, they have the last word."""
+    If keypoints have no error, outlines change nothing."""
     monkeypatch.setattr(Outlines, "of", lambda *_: outlines())
     given = with_c2(lambda c: turned(c, 1.0))
     biased = keypoints_of()
@@ -90,8 +90,8 @@ def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(
     assert "outlines" not in exact.reasons["c2"] and off_px(exact.cameras)[2] < 0.1
 
 
-def test_without_two_outlines_at_one_of_the_fitted_instants_cameras_stay() -> None:
-    """The fit is to the first of two instants, at which only one camera has an outline."""
+def test_cameras_stay_if_no_fitted_instant_has_two_outlines() -> None:
+    """Of two instants, the first is fitted; only one camera has an outline there."""
     seen = outlines().by_camera
     halves = Outlines({"c0": [None, seen["c0"][1]], "c1": list(seen["c1"][:2])}, (0, 1))
     given = ring(2)
@@ -100,8 +100,8 @@ def test_without_two_outlines_at_one_of_the_fitted_instants_cameras_stay() -> No
 
 
 def test_a_zoomed_camera_sees_the_person_at_the_same_place_and_size() -> None:
-    """Twice the focal length from twice as far: 10 cm beside the pivot across the line of sight stay where they are
-    seen, and 10 cm before it come closer to it, by the ratio of depths."""
+    """At twice the focal length and distance, a point 10 cm to the side of the pivot stays at its pixel. If it is also
+    10 cm nearer to the camera, it is seen closer to the pivot, by the ratio of depths."""
     camera = ring(4)[1]
     beside_m, before_m = MIDDLE_M + 0.1 * camera.R[0], MIDDLE_M + 0.1 * camera.R[0] - 0.1 * camera.R[2]
     far = _zoomed_about(camera, 2.0, MIDDLE_M)
@@ -112,9 +112,9 @@ def test_a_zoomed_camera_sees_the_person_at_the_same_place_and_size() -> None:
     assert far.project(before_m)[0][0] - camera.project(MIDDLE_M)[0][0] == pytest.approx(seen_px)
 
 
-def test_an_unknown_focal_length_returns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A box that moves by a metre; three cameras a tenth too long, each that much too far away. The fourth's is
-    known."""
+def test_outlines_recover_an_unknown_focal_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A box moves by a metre. Three cameras have a focal length that is a tenth too long and stand as much too far
+    away; the focal length of the fourth is known."""
     monkeypatch.setattr(silhouettes, "POINTS", 48)
     monkeypatch.setattr(outline_adjustment, "EVALUATIONS", 8)
     given = [camera if camera.name == "c3" else _zoomed_about(camera, 1.1, MIDDLE_M) for camera in ring(4)]

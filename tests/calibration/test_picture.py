@@ -13,8 +13,8 @@ from tests.calibration.synthetic import STANDING_M, ring
 
 
 @pytest.mark.parametrize("up", ["z", "y"])
-def test_from_above_a_ring_goes_round_as_it_does(up: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Counter-clockwise about the vertical, whichever axis that is: not mirrored, as seen from below."""
+def test_the_view_from_above_is_not_mirrored(up: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ring goes counter-clockwise about the vertical, whichever axis that is; from below it would be mirrored."""
     drawn = list[Axes]()
     monkeypatch.setattr(picture, "_draw_scene", lambda *given: drawn.append(given[0]) or _draw_scene(*given))
     cameras = [dataclasses.replace(c, R=c.R @ Y_UP_FROM_Z_UP.T) if up == "y" else c for c in ring(4)]
@@ -24,7 +24,9 @@ def test_from_above_a_ring_goes_round_as_it_does(up: str, tmp_path: Path, monkey
     assert (np.diff(np.unwrap(np.arctan2(y - y.mean(), x - x.mean()))) > 0).all()
 
 
-def test_several_cameras_without_keypoints_are_not_called_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_cameras_without_keypoints_are_not_labelled_as_one_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     said = []
     monkeypatch.setattr(Axes, "text", lambda _, x, y, text, **__: said.append(text))
     status = {"c0": "ok", "c1": "ok", "c2": "unjudged"}
@@ -33,8 +35,8 @@ def test_several_cameras_without_keypoints_are_not_called_one(tmp_path: Path, mo
     assert said == ["no keypoints: no residuals", "one camera: no residuals"]
 
 
-def test_a_camera_in_the_origin_is_drawn_too() -> None:
-    """Its frustum reaches 0.15 of the 4 m to the person along rays to corners 499.5 px off, at 1000 px focal length."""
+def test_a_camera_at_the_origin_is_drawn() -> None:
+    """Its frustum extends 0.15 of the 4 m to the person along rays to corners 499.5 px off, at 1000 px focal length."""
     camera = dataclasses.replace(ring(1)[0], R=np.eye(3), t_m=np.zeros(3))
     axes = Figure().subplots()
     _draw_scene(axes, [camera], {"c0": "ok"}, np.full((1, *STANDING_M.shape), [0.0, 0, 4]), (0, 2))

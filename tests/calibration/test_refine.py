@@ -19,8 +19,8 @@ SETTINGS = CalibrationSettings()
 NO_MATCHES = Matches({}, 0)
 
 
-class OutlinesThat:
-    """Stand-in for the outlines of one instant: the same cost for any refined cameras."""
+class OutlinesCosting:
+    """Stand-in for the outlines of one instant: one cost for the given cameras, another for any refined ones."""
 
     instants = (0,)
 
@@ -52,9 +52,9 @@ def with_c2(change: Any) -> list[Camera]:
 
 
 @pytest.mark.parametrize(("after_px", "accepted"), [(0.1, True), (0.54, True), (0.6, False)])
-def test_outlines_have_a_veto(tmp_path: Path, after_px: float, accepted: bool) -> None:
+def test_refined_cameras_are_rejected_if_outlines_fit_worse(tmp_path: Path, after_px: float, accepted: bool) -> None:
     given = with_c2(lambda c: turned(c, 1.0))
-    found = refined(tmp_path, given, keypoints_of(), OutlinesThat(given, 0.5, after_px))
+    found = refined(tmp_path, given, keypoints_of(), OutlinesCosting(given, 0.5, after_px))
     assert [new is not old for new, old in zip(found.cameras, given, strict=True)] == [False, False, accepted, False]
     assert found.outlines_px == {"as given": 0.5, "refined": after_px}
     assert any("outlines fit worse, from 0.50 to 0.60 px" in note for note in found.notes) != accepted
@@ -62,15 +62,15 @@ def test_outlines_have_a_veto(tmp_path: Path, after_px: float, accepted: bool) -
 
 
 @pytest.mark.parametrize(("after_px", "accepted"), [(0.039, True), (0.06, False)])
-def test_outlines_may_lose_no_larger_share_than_keypoints_gain(after_px: float, accepted: bool) -> None:
-    """Keypoints gain a third; the outlines' cost may rise from .03 to .04 px."""
+def test_outlines_may_lose_no_larger_a_share_than_keypoints_gain(after_px: float, accepted: bool) -> None:
+    """Keypoints improve by a third, so the outlines' cost may rise by a third, from .03 to .04 px."""
     given, changed = ring(4), with_c2(lambda c: turned(c, 1.0))
-    _, refusal = judge_by_outlines(OutlinesThat(given, 0.03, after_px), given, changed, 1 / 3)  # type: ignore[arg-type]
+    _, refusal = judge_by_outlines(OutlinesCosting(given, 0.03, after_px), given, changed, 1 / 3)  # type: ignore[arg-type]
     assert (refusal == "") == accepted
 
 
 @pytest.mark.parametrize("as_given", [True, False])
-def test_matches_between_two_cameras_have_a_say(tmp_path: Path, as_given: bool) -> None:
+def test_matches_can_prevent_refinement(tmp_path: Path, as_given: bool) -> None:
     """c2 is turned by a degree. Matches that agree with the turned camera keep it; those of the true camera let it be
     refined."""
     given, points_m = with_c2(lambda c: turned(c, 1.0)), walk_m().reshape(-1, 3)[:40]
@@ -80,8 +80,8 @@ def test_matches_between_two_cameras_have_a_say(tmp_path: Path, as_given: bool) 
     assert ("but matches of c1 and c2 go from 0.00 to" in found.reasons["c2"]) == as_given
 
 
-def test_what_a_detector_gets_wrong_of_a_joint_moves_no_camera(tmp_path: Path) -> None:
-    # Each camera's detector puts each joint 4 px off, the same in every frame: held-out frames alone would prove it.
+def test_constant_detector_bias_moves_no_camera(tmp_path: Path) -> None:
+    # Each joint is detected 4 px off, in every frame alike: judged by held-out frames alone, refining would seem right.
     bias = 4 * np.random.default_rng(3).normal(size=(4, 1, 25, 2))
     keypoints = keypoints_of()
     keypoints[..., :2] += bias
@@ -89,8 +89,8 @@ def test_what_a_detector_gets_wrong_of_a_joint_moves_no_camera(tmp_path: Path) -
     assert refined(tmp_path, given, keypoints).cameras is given
 
 
-def test_a_wrong_focal_length_is_refined_where_the_pose_does_not_suffice(tmp_path: Path) -> None:
-    # The figure walks 0.4 m to and fro before a camera 3.5 m away: a fifth in focal length cannot pass for distance.
+def test_a_wrong_focal_length_is_refined_if_the_pose_does_not_suffice(tmp_path: Path) -> None:
+    # The figure walks 0.4 m to and fro, 3.5 m from the camera: no distance imitates a focal length that is off by 1/5.
     zoom = np.array([[1.2, 1, 1], [1, 1.2, 1], [1, 1, 1]])
     found = refined(tmp_path, with_c2(lambda c: dataclasses.replace(c, K=c.K * zoom)), keypoints_of())
     assert found.reasons["c2"].startswith("pose and focal length refined")
@@ -101,13 +101,13 @@ def test_a_wrong_focal_length_is_refined_where_the_pose_does_not_suffice(tmp_pat
     assert np.median(error_px) < 1
 
 
-def test_one_moment_is_enough_to_refine_a_camera(tmp_path: Path) -> None:
+def test_one_frame_is_enough_to_refine_a_camera(tmp_path: Path) -> None:
     given = with_c2(lambda c: turned(c, 2.0))
     found = refined(tmp_path, given, keypoints_of()[:, :1])
     assert [new is not old for new, old in zip(found.cameras, given, strict=True)] == [False, False, True, False]
 
 
-def test_two_cameras_wrong_leave_the_others_alone(tmp_path: Path) -> None:
+def test_two_wrong_cameras_are_refined_and_the_others_kept(tmp_path: Path) -> None:
     given = [turned(c, 1.0, axis=i) if i < 2 else c for i, c in enumerate(ring(4))]
     found = refined(tmp_path, given, keypoints_of())
     assert [new is not old for new, old in zip(found.cameras, given, strict=True)] == [True, True, False, False]
@@ -115,14 +115,14 @@ def test_two_cameras_wrong_leave_the_others_alone(tmp_path: Path) -> None:
         assert np.median(np.linalg.norm(new.project(walk_m())[0] - true.project(walk_m())[0], axis=-1)) < 1
 
 
-def test_one_of_many_cannot_hide(tmp_path: Path) -> None:
+def test_one_wrong_camera_among_six_is_found(tmp_path: Path) -> None:
     given = [turned(camera, 0.5) if camera.name == "c5" else camera for camera in ring(6)]
     keypoints = np.stack([seen[::2, 0] for seen in detections(ring(6), 2).values()])
     found = refined(tmp_path, given, keypoints)
     assert [camera.name for camera, old in zip(found.cameras, given, strict=True) if camera is not old] == ["c5"]
 
 
-def test_two_cameras_are_never_judged_one_by_one(tmp_path: Path) -> None:
+def test_with_two_cameras_neither_is_refined(tmp_path: Path) -> None:
     given = ring(4)[:2]
     found = refined(tmp_path, given, keypoints_of()[:2])
     assert found.cameras is given
@@ -130,7 +130,7 @@ def test_two_cameras_are_never_judged_one_by_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cause", [*MISTAKES, *SINGLE_CAMERA_MISTAKES])
-def test_one_cameras_mistake_is_undone(cause: str) -> None:
+def test_a_known_mistake_in_one_camera_is_undone(cause: str) -> None:
     make = dict(MISTAKES)
     make["T is the camera's centre"] = lambda c: dataclasses.replace(c, t_m=c.centre_m)
     make |= {
@@ -150,7 +150,7 @@ def test_a_camera_far_off_for_no_known_reason_is_left_to_refinement() -> None:
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_every_camera_has_its_reasons(tmp_path: Path) -> None:
+def test_the_report_gives_reasons_for_every_camera(tmp_path: Path) -> None:
     capture = write_capture(tmp_path, with_c2(lambda c: turned(c, 1.0)), detections(ring(4), 1))
     report = check_calibration(capture, SETTINGS)
     said = {name: " | ".join(verdict.reasons) for name, verdict in report.verdicts.items()}

@@ -20,7 +20,7 @@ CORNERS_M = np.array(list(product([-0.2, 0.2], [-0.3, 0.3], [0.1, 1.7])))
 
 
 def mask(camera: Camera, corners_m: np.ndarray = CORNERS_M) -> np.ndarray:
-    """Return the mask, drawn at an eighth of a pixel so that pixels are inside if their centres are."""
+    """Return the mask of a box, drawn to 1/256 px, so that pixels are inside if their centres are."""
     corners_px = (camera.project(corners_m)[0] * 256).round().astype(np.int32)
     drawn = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     cv2.fillConvexPoly(drawn, cv2.convexHull(corners_px), 1, lineType=cv2.LINE_8, shift=8)
@@ -34,7 +34,7 @@ def outlines(cameras: list[Camera], corners_m: np.ndarray = CORNERS_M) -> Outlin
 def test_distance_and_points_by_hand() -> None:
     square = np.zeros((20, 30), bool)
     square[5:15, 10:20] = True
-    square[8:10, 12:14] = False  # a hole and a speck are faults of the mask
+    square[8:10, 12:14] = False  # a hole and a speck, errors of the mask
     square[0, 0] = True
     found = MaskOutline.around(square)
     assert found is not None
@@ -44,7 +44,7 @@ def test_distance_and_points_by_hand() -> None:
     assert found.centre_px == pytest.approx([14.5, 9.5])
 
 
-def test_no_outline_where_the_image_ends() -> None:
+def test_there_is_no_outline_at_the_image_border() -> None:
     assert MaskOutline.around(np.zeros((20, 30), bool)) is None
     cut_off = np.zeros((20, 30), bool)
     cut_off[10:, 5:15] = True
@@ -54,7 +54,7 @@ def test_no_outline_where_the_image_ends() -> None:
 
 
 def test_a_point_behind_a_camera_is_outside_its_mask() -> None:
-    """The middle of the box, and as far behind the camera, where it would be seen in the same pixel."""
+    """The middle of the box, and its mirror image behind the camera, which would project to the same pixel."""
     camera = ring(1)[0]
     outline, middle_m = MaskOutline.around(mask(camera)), CORNERS_M.mean(0)
     assert outline is not None
@@ -63,16 +63,16 @@ def test_a_point_behind_a_camera_is_outside_its_mask() -> None:
     assert found_px[0] < -10 and found_px[1] == BEHIND_CAMERA_PX
 
 
-def test_a_true_rig_costs_nothing() -> None:
+def test_a_true_rig_has_almost_no_cost() -> None:
     cameras = ring(4)
     residuals_px = np.concatenate(list(outlines(cameras).residuals_px(cameras).values()))
     assert residuals_px.max() < 1.5
     assert outlines(cameras).cost_px(cameras) < 0.05
 
 
-def test_a_camera_pitched_by_a_degree_misses_by_that_much() -> None:
-    # Two cameras at a right angle, level with the box's middle. One degree moves the picture of c0 by 17.5 px: the
-    # rays of its lower or upper edge pass c1's box by that much, those of the other three edges go through it.
+def test_the_residual_of_a_pitched_camera_by_hand() -> None:
+    # Two cameras at a right angle, level with the box's middle. One degree moves the image of c0 by 17.5 px: the rays
+    # of its lower or upper edge miss c1's box by that much, those of the other three edges go through it.
     centres_m = {"c0": [3.5, 0, 0.9], "c1": [0, 3.5, 0.9]}
     cameras = [look_at(name, np.array(at), np.array([0, 0, 0.9])) for name, at in centres_m.items()]
     seen = outlines(cameras)
@@ -85,7 +85,7 @@ def test_a_camera_pitched_by_a_degree_misses_by_that_much() -> None:
     assert len(wrong_way) > 2 and np.ptp(wrong_way) < 60
 
 
-def test_rigs_that_are_off_cost_more() -> None:
+def test_a_rig_with_a_turned_camera_costs_more() -> None:
     cameras = ring(4)
     seen = outlines(cameras)
     for i, axis in product(range(4), (0, 1)):
@@ -93,7 +93,7 @@ def test_rigs_that_are_off_cost_more() -> None:
         assert seen.cost_px(off) > 0.5
 
 
-def test_a_camera_without_mask_takes_no_part() -> None:
+def test_a_camera_without_masks_is_left_out() -> None:
     cameras = ring(4)
     partly = Outlines(dict(outlines(cameras[:3]).by_camera) | {"c3": [None]}, (0,))
     residuals_px = partly.residuals_px([*cameras[:3], turned(cameras[3], 20)])
@@ -101,10 +101,9 @@ def test_a_camera_without_mask_takes_no_part() -> None:
     assert max(row.max() for row in residuals_px.values() if len(row)) < 1.5
 
 
-def test_small_changes_are_those_that_a_search_anew_finds() -> None:
-    """Every camera is half a degree off, so that rays miss the hull, and each in turn is moved by 3 mm, 3.5 m away at a
-    focal length of 1000 px: the rays that change at all change by up to 0.86 px. A camera without outlines changes
-    nothing."""
+def test_changes_near_the_hull_match_recomputed_residuals() -> None:
+    """Every camera is turned by half a degree, so that rays miss the hull. Each in turn is moved by 3 mm; at a distance
+    of 3.5 m and a focal length of 1000 px, rays change by up to 0.86 px. A camera without outlines changes nothing."""
     seen = outlines(ring(4))
     given = [turned(camera, 0.5, axis=i % 2) for i, camera in enumerate(ring(4))]
     given.append(dataclasses.replace(given[0], name="without outlines"))
@@ -121,8 +120,8 @@ def test_small_changes_are_those_that_a_search_anew_finds() -> None:
     assert (found_px[4] == 0).all()
 
 
-def test_rays_that_come_out_of_the_hull_count() -> None:
-    """A camera of a true rig is moved from 1.5 mm left to 1.5 mm right: rays at one side come out."""
+def test_changes_near_the_hull_include_rays_that_leave_it() -> None:
+    """A camera of a true rig is moved from 1.5 mm left to 1.5 mm right: rays at one side leave the hull."""
     seen, rig = outlines(ring(4)), ring(4)
     left, right = (dataclasses.replace(rig[0], t_m=rig[0].t_m + np.array([x, 0, 0])) for x in (-0.0015, 0.0015))
     before_px, after_px = (np.concatenate([*seen.residuals_px([c, *rig[1:]]).values()]) for c in (left, right))
@@ -132,34 +131,34 @@ def test_rays_that_come_out_of_the_hull_count() -> None:
 
 
 @pytest.fixture(scope="module")
-def of_wave(wave: Capture) -> Outlines:
+def wave_outlines(wave: Capture) -> Outlines:
     found = Outlines.of(wave)
     assert found is not None
     return found
 
 
-def test_a_rendered_capture_tells_a_turned_camera(wave: Capture, of_wave: Outlines) -> None:
+def test_outlines_of_a_rendered_capture_reveal_a_turned_camera(wave: Capture, wave_outlines: Outlines) -> None:
     cameras = [wave.cameras[name] for name in wave.train_cameras]
-    assert of_wave.cost_px(cameras) < 0.05
+    assert wave_outlines.cost_px(cameras) < 0.05
     for i, camera in enumerate(cameras):
         off = turned(camera, 1.0, axis=i % 2)
-        assert of_wave.cost_px([off if j == i else other for j, other in enumerate(cameras)]) > 0.1
+        assert wave_outlines.cost_px([off if j == i else other for j, other in enumerate(cameras)]) > 0.1
 
 
-def test_wrong_cameras_do_not_change_the_masks(wave: Capture, of_wave: Outlines) -> None:
+def test_wrong_cameras_do_not_change_the_masks(wave: Capture, wave_outlines: Outlines) -> None:
     inverted = {
         name: dataclasses.replace(c, R=c.R.T, t_m=-c.R.T @ c.t_m) for name, c in wave.cameras.items()
     }  # fmt: skip
     found = Outlines.of(wave.with_cameras(inverted))
     assert found is not None
     for name in wave.train_cameras:
-        for one, other in zip(of_wave.by_camera[name], found.by_camera[name], strict=True):
+        for one, other in zip(wave_outlines.by_camera[name], found.by_camera[name], strict=True):
             assert one is not None and other is not None
             np.testing.assert_allclose(one.distance_px, other.distance_px, atol=1e-4)  # OpenCV's last bits vary
 
 
-def test_outlines_are_of_whom_the_recording_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Named in one camera, the person is followed into the others."""
+def test_outlines_show_the_subject_that_the_recording_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The person is named in one camera and found in the others, too."""
     capture, each = recorded(tmp_path, ring(3), staying((0, -0.6)), staying((0, 0.6)))
     x, y, _ = each[1]["c1"][7, 0]
     backend = SimpleNamespace(mask=lambda frame, prior: prior.body)

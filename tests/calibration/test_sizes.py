@@ -24,13 +24,13 @@ def with_bars(narrow: Capture) -> Capture:
 
 
 def test_each_change_by_hand() -> None:
-    # f = 1000, principal point 499.5, of a picture 80 px wider when calibrated.
+    # f = 1000, principal point 499.5; the image was 80 px wider when calibrated.
     camera = ring(1)[0]
     changed = {what: change(camera, (1080, 1000), (1000, 1000)).K for what, change in SIZE_CHANGES.items()}
     assert changed["cropped or padded symmetrically"][0].tolist() == [1000, 0, 459.5]
     assert changed["cropped or padded on the left or at the top"][0].tolist() == [1000, 0, 419.5]
-    # The middle of the picture stays its middle: half of 1000 is 500, half a pixel from the centre at 499.5; 540 of the
-    # calibrated 1080 become 500, so what was at 500 comes to lie at 500 * 1000 / 1080 = 462.963.
+    # Positions scale from the image's border, which is half a pixel outside the first pixel's centre: 499.5 is 500 from
+    # it and goes to 500 * 1000 / 1080 = 462.963, that is 462.463.
     assert changed["stretched"][:2].round(3).tolist() == [[925.926, 0, 462.463], [0, 1000, 499.5]]
     assert changed["scaled and padded symmetrically"][:2].round(3).tolist() == [
         [925.926, 0, 462.463],
@@ -38,15 +38,15 @@ def test_each_change_by_hand() -> None:
     ]
 
 
-def test_changes_are_the_same_in_a_picture_that_was_shrunk() -> None:
-    """Calibrated and recorded twice as large, and read at half the size."""
+def test_size_changes_do_not_depend_on_shrinking() -> None:
+    """The image was calibrated and recorded at twice the size, and is read at half of that."""
     camera = ring(1)[0]
     for change in SIZE_CHANGES.values():
         shrunk, whole = (change(camera, (times * 1080, times * 1000), (times * 1000,) * 2) for times in (2, 1))
         np.testing.assert_allclose(shrunk.K, whole.K)
 
 
-def test_bars_explain_a_size(narrow: Capture) -> None:
+def test_black_bars_explain_a_change_of_size(narrow: Capture) -> None:
     assert [name for name in narrow.cameras if size_unexplained(narrow, name)] == ["c1"]
     assert size_reasons(narrow, "c0") == []
     assert size_reasons(narrow, "c1") == [
@@ -59,10 +59,10 @@ def test_bars_explain_a_size(narrow: Capture) -> None:
     )
 
 
-def test_residuals_choose_only_where_bars_do_not_explain_and_only_with_proof(narrow: Capture) -> None:
+def test_residuals_decide_on_a_size_change_only_without_bars_and_with_proof(narrow: Capture) -> None:
     cameras = ring(4)
     keypoints = np.stack([seen[:, 0] for seen in detections(cameras, 1).values()])
-    # The picture was stretched: the intrinsics of the wider one are 1.08 times too long across.
+    # The image was stretched: for it, the intrinsics of the wider image are 1.08 times too long horizontally.
     K = np.array([[1.08, 0, 0.04], [0, 1, 0], [0, 0, 1]]) @ cameras[1].K
     as_calibrated = [dataclasses.replace(c, K=K) if c.name == "c1" else c for c in cameras]
     costs: dict[str, float] = {}

@@ -20,7 +20,7 @@ FRAMES = 48
 def poses_m(instants: np.ndarray) -> np.ndarray:
     """Return joints (n, 25, 3) of the figure moving to and fro with swinging arms.
 
-    On a circle at constant speed a time offset would look like a rotation of the world, that is, a moved camera.
+    On a circle at constant speed, an offset in time would look like a rotation of the world, i.e. a moved camera.
     """
     poses = np.repeat(STANDING_M[None], len(instants), axis=0)
     poses[:, [3, 4, 6, 7], 0] += 0.2 * np.sin(instants / 5)[:, None] * np.array([1, 1, -1, -1])
@@ -30,8 +30,8 @@ def poses_m(instants: np.ndarray) -> np.ndarray:
 
 
 def recorded(offsets: dict[str, float], frames: int = FRAMES, noise_px: float = 2, speed: float = 1) -> np.ndarray:
-    """Return keypoints (4, frames, 25, 3) recorded by the ring. A camera recorded the instant of frame f in its frame f
-    + offset, so its frame f shows the instant f - offset."""
+    """Return keypoints (4, frames, 25, 3) recorded by the ring. A camera's frame f + offset shows the instant f, so its
+    frame f shows the instant f - offset."""
     rng, seen = np.random.default_rng(1), []
     for camera in ring(4):
         uv = camera.project(poses_m(speed * (np.arange(frames) - offsets.get(camera.name, 0.0))))[0]
@@ -46,19 +46,19 @@ def capture_of(root: Path, keypoints: np.ndarray, frames: tuple[int, ...] | None
 
 
 @pytest.mark.parametrize(("name", "offset"), [("c0", 3.0), ("c1", -2.3), ("c2", 0.5), ("c3", -0.3)])
-def test_the_camera_out_of_step_is_found(name: str, offset: float) -> None:
+def test_one_unsynchronised_camera_is_found(name: str, offset: float) -> None:
     offsets, held_out_px, notes = synchronise(ring(4), recorded({name: offset}), range(FRAMES), SETTINGS)
     assert offsets == {name: pytest.approx(offset, abs=0.08)}
     assert min(held_out_px, key=held_out_px.__getitem__).startswith(f"camera {name} shifted by")
     assert not notes
 
 
-def test_several_cameras_out_of_step() -> None:
+def test_several_unsynchronised_cameras_are_found() -> None:
     offsets, _, _ = synchronise(ring(4), recorded({"c0": 2.0, "c3": -1.4}), range(FRAMES), SETTINGS)
     assert offsets == {"c0": pytest.approx(2, abs=0.1), "c3": pytest.approx(-1.4, abs=0.1)}
 
 
-def test_cameras_in_step_stay_so() -> None:
+def test_synchronised_cameras_get_no_offset() -> None:
     keypoints = recorded({})
     assert synchronise(ring(4), keypoints, range(FRAMES), SETTINGS) == ({}, {}, [])
     for timing in measure_timing(ring(4), keypoints, range(FRAMES)).values():
@@ -66,14 +66,14 @@ def test_cameras_in_step_stay_so() -> None:
         assert abs(timing.offset_frames) < 4 * timing.error_frames < 0.25
 
 
-def test_a_turned_camera_is_not_out_of_step() -> None:
+def test_a_turned_camera_gets_no_offset() -> None:
     # A degree is 17 px, about as far as the figure moves in one frame.
     cameras = [turned(camera, 1.0) if camera.name == "c1" else camera for camera in ring(4)]
     assert synchronise(cameras, recorded({}), range(FRAMES), SETTINGS)[0] == {}
 
 
-def test_who_hardly_moves_shows_no_offset() -> None:
-    # A hundredth of walking speed: a frame moves him by less than a pixel, and two by less than the noise.
+def test_no_offset_is_measured_if_the_person_hardly_moves() -> None:
+    # At a hundredth of walking speed, the person moves less than a pixel per frame; two frames are less than the noise.
     keypoints = recorded({"c1": 2.0}, speed=0.01)
     assert synchronise(ring(4), keypoints, range(FRAMES), SETTINGS)[0] == {}
     reasons = [timing.reason for timing in measure_timing(ring(4), keypoints, range(FRAMES)).values()]
@@ -81,12 +81,12 @@ def test_who_hardly_moves_shows_no_offset() -> None:
     assert any("too little motion" in reason for reason in reasons)
 
 
-def test_two_cameras_cannot_tell() -> None:
+def test_two_cameras_cannot_measure_offsets() -> None:
     found = measure_timing(ring(4)[:2], recorded({})[:2], range(FRAMES))
     assert {timing.reason for timing in found.values()} == {"it takes two other cameras to place keypoints"}
 
 
-def test_the_report_corrects_and_says_so(tmp_path: Path, no_pictures: None) -> None:
+def test_an_offset_is_corrected_and_reported(tmp_path: Path, no_pictures: None) -> None:
     capture = capture_of(tmp_path / "in", recorded({"c2": 2.0}))
     report = check_calibration(capture, SETTINGS)
     assert [verdict.status for verdict in report.verdicts.values()] == ["ok", "ok", "refined", "ok"]
@@ -98,19 +98,19 @@ def test_the_report_corrects_and_says_so(tmp_path: Path, no_pictures: None) -> N
     assert used.frames == tuple(range(46))
     found, given = used.keypoints("c2"), capture.keypoints("c2")
     assert found is not None and given is not None
-    # Frame 5 of the others is frame 7 of this one, but for a few hundredths.
+    # Frame 5 of the other cameras is frame 7 of this one, to within a few hundredths.
     assert np.abs(found[5] - given[7]).max() < 2
 
 
-def test_an_offset_whose_error_is_not_known_is_told_without_one(tmp_path: Path, no_pictures: None) -> None:
-    """Of twelve frames nine are left, too few to measure what remains."""
+def test_an_offset_of_unknown_error_is_reported_without_one(tmp_path: Path, no_pictures: None) -> None:
+    """Nine of twelve frames are left, too few to measure the remaining offset."""
     report = check_calibration(capture_of(tmp_path, recorded({"c2": 3.0}, frames=12, speed=2)), SETTINGS)
     assert np.isnan(report.verdicts["c2"].timing.error_frames)
     told = next(reason for reason in report.verdicts["c2"].reasons if reason.startswith("out of step"))
     assert told == f"out of step by {report.verdicts['c2'].frame_offset:+.2f} frames: corrected"
 
 
-def test_strided_frames_say_what_to_cut(tmp_path: Path, no_pictures: None) -> None:
+def test_unsynchronised_strided_frames_are_refused_with_what_to_cut(tmp_path: Path, no_pictures: None) -> None:
     strided = recorded({"c0": -2.0, "c1": 0.0}, frames=4 * FRAMES)[:, ::4]
     capture = capture_of(tmp_path, strided, frames=tuple(range(0, 4 * FRAMES, 4)))
     with pytest.raises(InputError) as caught:
@@ -119,7 +119,7 @@ def test_strided_frames_say_what_to_cut(tmp_path: Path, no_pictures: None) -> No
     assert "2 from camera c1, 2 from camera c2, 2 from camera c3" in str(caught.value)
 
 
-def test_strided_frames_show_what_is_less_than_a_frame_off(tmp_path: Path, no_pictures: None) -> None:
+def test_strided_frames_with_an_offset_below_one_frame_are_kept(tmp_path: Path, no_pictures: None) -> None:
     """Keypoints are synchronised; of the ingested frames, each camera shows the image closest to the instant."""
     strided = recorded({"c0": 0.8}, frames=4 * FRAMES, noise_px=0.5, speed=0.5)[:, ::4]
     capture = capture_of(tmp_path / "in", strided, frames=tuple(range(0, 4 * FRAMES, 4)))
@@ -135,10 +135,10 @@ def test_strided_frames_show_what_is_less_than_a_frame_off(tmp_path: Path, no_pi
     assert np.abs(found[5] - (0.8 * given[5] + 0.2 * given[6])).max() < 2
 
 
-def test_numbers_with_gaps_count_in_recorded_frames(
+def test_offsets_are_in_recorded_frames_if_images_are_numbered_in_fives(
     tmp_path: Path, no_pictures: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With images numbered 0, 5, 10, ..., an offset of 2 numbers is 0.4 of the distance between images."""
+    """With images numbered 0, 5, 10, ..., an offset of 2 is 0.4 of the interval between images."""
     numbers = tuple(range(0, 5 * FRAMES, 5))
     capture = dataclasses.replace(capture_of(tmp_path, recorded({}), frames=numbers), frame_step=5)
     monkeypatch.setattr(synchronise_module, "synchronise", lambda *_: ({"c1": 2.0}, {}, []))
@@ -147,7 +147,7 @@ def test_numbers_with_gaps_count_in_recorded_frames(
     assert not notes
 
 
-def test_recorded_frame_numbers_count() -> None:
+def test_offsets_allow_for_gaps_in_frame_numbers() -> None:
     # Frames 16 to 23 were never ingested: neighbours in the array are not neighbours in time.
     frames = [frame for frame in range(FRAMES) if not 16 <= frame < 24]
     offsets, _, _ = synchronise(ring(4), recorded({"c1": 1.0})[:, frames], frames, SETTINGS)

@@ -1,4 +1,4 @@
-"""Small videos with what phones write and OpenCV does not: a rotation, frames at an uneven rate, edit lists."""
+"""Small videos with what phones write but OpenCV does not: a rotation, an uneven frame rate, edit lists."""
 
 import struct
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-QUARTER_TURN = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)  # clockwise, of tkhd's matrix
+QUARTER_TURN = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)  # clockwise, as the matrix in tkhd
 CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts")
 
 
@@ -23,12 +23,12 @@ def write_video(path: Path, levels: list[int], size_px: tuple[int, int] = (96, 6
 
 
 def rotate(path: Path) -> None:
-    """Let a video be shown turned by 90 degrees clockwise."""
+    """Mark a video as to be shown turned by 90 degrees clockwise."""
     _edit(path, b"tkhd", lambda content: content[:40] + QUARTER_TURN + content[76:])
 
 
 def hold_frames(path: Path, first: int, rest: int) -> None:
-    """Let all frames of a video after the first `first` last twice as long; `rest` is their number."""
+    """Make the `rest` frames of a video after the first `first` last twice as long."""
 
     def slower(content: bytes) -> bytes:
         (step,) = struct.unpack(">I", content[12:16])
@@ -39,8 +39,8 @@ def hold_frames(path: Path, first: int, rest: int) -> None:
 
 
 def trim(path: Path, *edits: tuple[int | None, int], wide: bool = False) -> None:
-    """Let a video show these frames alone, as those do that are trimmed without being encoded again. edits: the first
-    frame, None for nothing meanwhile, and the number of frames; wide: in numbers of 64 bits."""
+    """Make a video show only some frames, as after trimming without encoding again. edits: the first frame, None for
+    showing nothing, and the number of frames; wide: whether to write 64-bit numbers."""
     content = path.read_bytes()
     movie_rate, rate = (_number(content, kind, 12) for kind in (b"mvhd", b"mdhd"))
     step, form = _number(content, b"stts", 12), ">QqI" if wide else ">IiI"
@@ -52,7 +52,7 @@ def trim(path: Path, *edits: tuple[int | None, int], wide: bool = False) -> None
 
 
 def declare_samples(path: Path, count: int) -> None:
-    """Let a video declare this many samples, each of one byte."""
+    """Make a video declare this many samples of one byte each."""
     _edit(path, b"stsz", lambda _: struct.pack(">III", 0, 1, count))
     _edit(path, b"stsc", lambda _: struct.pack(">IIIII", 0, 1, 1, count, 1))
     _edit(path, b"stts", lambda _: struct.pack(">IIII", 0, 1, count, 1))
@@ -63,7 +63,7 @@ def box(kind: bytes, content: bytes) -> bytes:
 
 
 def _number(content: bytes, kind: bytes, at: int) -> int:
-    """Return the number of 32 bits at a place of the first box of a kind."""
+    """Return the 32-bit number at offset `at` in the first box of a kind."""
     start = content.index(kind) + 4 + at
     return int.from_bytes(content[start : start + 4], "big")
 
@@ -73,7 +73,7 @@ def _edit(path: Path, wanted: bytes, change: Callable[[bytes], bytes]) -> None:
 
 
 def _edited(content: bytes, wanted: bytes, change: Callable[[bytes], bytes]) -> bytes:
-    """Return boxes with the content of those of one kind changed; moov comes last, so that no offset moves."""
+    """Return boxes with the content of one kind of box changed. moov comes last, so no offset changes."""
     done, at = b"", 0
     while at < len(content):
         size, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]

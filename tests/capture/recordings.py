@@ -1,4 +1,4 @@
-"""Small recordings made by hand, in each layout, for the tests to read and to break."""
+"""Small synthetic recordings in each layout, for tests to read and to damage."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ TRANSLATIONS_M = {"01": [0.0, 1, 3], "02": [0.0, 1, 3]}
 
 
 def picture(camera: str, frame: int) -> np.ndarray:
-    """Return an image (16, 24, 3) uint8 RGB of noise, so that no two are equal."""
+    """Return an image (16, 24, 3) uint8 RGB of noise; no two are equal."""
     return np.random.default_rng([int(camera[-2:]), frame]).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
@@ -62,7 +62,7 @@ def write_easymocap(folder: Path) -> Path:
 
 
 def write_video(path: Path, count: int, size_px: tuple[int, int] = (64, 48), fps: float = 25.0) -> None:
-    """Write a video whose frame f is grey of value 20 + 20 f."""
+    """Write a video whose frame f has the grey level 20 + 20 f."""
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size_px)
     assert writer.isOpened()
@@ -72,7 +72,7 @@ def write_video(path: Path, count: int, size_px: tuple[int, int] = (64, 48), fps
 
 
 def write_pose2sim(folder: Path) -> Path:
-    """Write two cameras, ten frames of 64 x 48 px, calibrated at 64 x 48, without detections."""
+    """Write two cameras with ten frames of 64 x 48 px, calibrated at that size, and no people detected."""
     tables = []
     for camera in CAMERAS:
         rotation = cv2.Rodrigues(np.array(ROTATIONS[camera]))[0].ravel().tolist()

@@ -1,4 +1,4 @@
-"""Broken recordings are refused with one line that names the file, before anything is written."""
+"""Damaged recordings are refused with a one-line message that names the file, before anything is written."""
 
 import json
 import os
@@ -291,7 +291,7 @@ POSE2SIM = {
 
 
 def _cut_video(path: Path) -> None:
-    """Cut a video short: the header still promises ten frames, but the data of the later ones is gone."""
+    """Cut a video short: the header still declares ten frames, but the data of the later ones is gone."""
     data = path.read_bytes()
     start = data.index(b"mdat") + 4
     length = int.from_bytes(data[start - 8 : start - 4], "big") - 8
@@ -314,7 +314,7 @@ def _refused(folder: Path, tmp_path: Path, names: str) -> None:
         for name, case in cases.items()
     ],
 )
-def test_broken_folder_is_refused(
+def test_a_damaged_recording_is_refused(
     write: Callable[[Path], Path],
     damage: Callable[[Path], object],
     names: str,
@@ -328,7 +328,7 @@ def test_broken_folder_is_refused(
     assert not (tmp_path / "pickle-was-loaded").exists()
 
 
-def test_folder_that_is_no_capture_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     _refused(tmp_path / "empty", tmp_path, "none of EasyMocap")
     _refused(tmp_path / "absent", tmp_path, "no such folder")

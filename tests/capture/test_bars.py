@@ -1,4 +1,4 @@
-"""Black bars with known edges."""
+"""Detection of black bars with known edges, and the lens that follows from them."""
 
 import tracemalloc
 from pathlib import Path
@@ -31,30 +31,30 @@ def test_edges_are_found_to_a_fraction_of_a_pixel() -> None:
         rgb[:7] = 2
         rgb[-6:] = 3
         rgb[:, :4] = 0
-        rgb[-7] = rgb[-7] * 0.6  # the last row is picture over 0.6 of its height
+        rgb[-7] = rgb[-7] * 0.6  # the image covers 0.6 of the height of its last row
     found = picture_area(pictures)
     assert found[:3] == pytest.approx((4, 7, 196), abs=0.1)
     assert found.top + found.height == pytest.approx(293.6, abs=0.1)
 
 
-def test_no_bars_in_a_whole_or_a_dark_picture() -> None:
+def test_a_full_or_dark_image_has_no_bars() -> None:
     assert picture_area(frames()) == (0, 0, 200, 300)
     assert picture_area([rgb // 20 for rgb in frames()]) == (0, 0, 200, 300)
-    fade = np.linspace(0, 1, 40)[:, None, None]  # light that falls off towards the top is no bar
+    fade = np.linspace(0, 1, 40)[:, None, None]  # light that fades towards the top is not a bar
     pictures = frames()
     for rgb in pictures:
         rgb[:40] = rgb[:40] * fade**2
     assert picture_area(pictures) == (0, 0, 200, 300)
 
 
-def test_a_bar_is_dark_in_most_frames() -> None:
+def test_an_edge_that_is_dark_in_one_frame_is_not_a_bar() -> None:
     pictures = frames()
     pictures[0][:7] = 0
     assert picture_area(pictures) == (0, 0, 200, 300)
 
 
-def test_large_pictures_take_little_more_memory_than_they_are() -> None:
-    """Five pictures have 15 bytes a pixel; as floats they would have 40, and their median as many again."""
+def test_bars_are_found_with_little_memory_beyond_the_images() -> None:
+    """Five images take 15 bytes per pixel; as floats they would take 40, and their median as much again."""
     pictures = [np.full((2048, 512, 3), 90 + i, np.uint8) for i in range(5)]
     tracemalloc.start()
     assert picture_area(pictures) == (0, 0, 512, 2048)
@@ -62,21 +62,21 @@ def test_large_pictures_take_little_more_memory_than_they_are() -> None:
     tracemalloc.stop()
 
 
-def test_scale_and_offset_by_hand() -> None:
-    # Half size, 5 px from the left and 7 from the top: the calibrated picture's middle (99.5, 149.5) in centres is
-    # (100, 150) from the corner, so (55, 82) from the new corner and (54.5, 81.5) in centres.
+def test_the_lens_inside_bars_by_hand() -> None:
+    # Half the size, 5 px from the left and 7 px from the top. The middle of the calibrated image, at pixel (99.5,
+    # 149.5), is (100, 150) from the corner: (55, 82) from the new corner, at pixel (54.5, 81.5).
     lens = lens_for_area(LENS, Area(5, 7, 100, 150), (110, 164))
     assert lens is not None
     np.testing.assert_allclose(lens.K, np.array([[100, 0, 54.5], [0, 100, 81.5], [0, 0, 1]]))
 
 
-def test_without_bars_or_at_another_aspect_nothing_is_proven() -> None:
+def test_no_lens_follows_without_bars_or_at_another_aspect_ratio() -> None:
     assert lens_for_area(LENS, Area(0, 0, 100, 150), (100, 150)) is None
     assert lens_for_area(LENS, Area(5, 0, 100, 152), (110, 152)) is None
 
 
-def test_a_letterboxed_camera_is_matched_at_the_door(tmp_path: Path) -> None:
-    # 24 x 16 calibrated, doubled to 48 x 32 and put 20 px down in 48 x 72: the middle (11.5, 7.5) is at (23.5, 35.5).
+def test_ingestion_matches_a_letterboxed_camera_by_its_bars(tmp_path: Path) -> None:
+    # Calibrated at 24 x 16, doubled to 48 x 32, put 20 px down in 48 x 72: the middle (11.5, 7.5) is at (23.5, 35.5).
     folder = write_easymocap(tmp_path / "in")
     for path in sorted((folder / "images" / "01").iterdir()):
         tall = cv2.resize(picture("01", int(path.stem)) // 2 + 100, (48, 32), interpolation=cv2.INTER_NEAREST)

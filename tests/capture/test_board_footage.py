@@ -31,7 +31,7 @@ SQUARE_PX = 40
 
 
 def charuco_picture(inverted: bool) -> np.ndarray:
-    """Return the board above, 160 x 200 px, alone on 320 x 240 px grey, its top left pixel at (60, 20)."""
+    """Return the board above, 160 x 200 px, on a grey image of 320 x 240 px, with its top left pixel at (60, 20)."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     drawn = cv2.aruco.CharucoBoard((4, 5), 0.054, 0.0405, dictionary).generateImage((4 * SQUARE_PX, 5 * SQUARE_PX))
     picture = np.full((240, 320), 128, np.uint8)
@@ -40,21 +40,21 @@ def charuco_picture(inverted: bool) -> np.ndarray:
 
 
 def checkerboard_picture(columns: int, rows: int) -> np.ndarray:
-    """Return squares of 40 px from pixel (60, 60) on white, the first one black, with a margin as wide as one and a
-    half."""
+    """Return squares of 40 px, beginning with a black one at pixel (60, 60), with a white margin of one and a half
+    squares."""
     y, x = np.mgrid[: rows * SQUARE_PX, : columns * SQUARE_PX]
     picture = np.full((rows * SQUARE_PX + 120, columns * SQUARE_PX + 120), 255, np.uint8)
     picture[60:-60, 60:-60] = np.where((x // SQUARE_PX + y // SQUARE_PX) % 2, 255, 0)
     return np.stack([picture] * 3, -1)
 
 
-def test_corners_lie_row_by_row_between_the_squares() -> None:
+def test_corners_between_the_squares_are_listed_row_by_row() -> None:
     corners_m = Board(columns=4, rows=3, square_m=0.1).corners_m
     expected = [[0.1, 0.1, 0], [0.2, 0.1, 0], [0.3, 0.1, 0], [0.1, 0.2, 0], [0.2, 0.2, 0], [0.3, 0.2, 0]]
     assert corners_m.tolist() == pytest.approx(np.array(expected))
 
 
-def test_the_measured_square_comes_before_the_page(tmp_path: Path) -> None:
+def test_a_measured_square_size_takes_precedence_over_the_page_size(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     board = read_board(tmp_path)
     assert board is not None and board.square_m == pytest.approx(0.054) and board.inverted
@@ -63,7 +63,7 @@ def test_the_measured_square_comes_before_the_page(tmp_path: Path) -> None:
     assert page is not None and page.square_m == pytest.approx(min(8.5 / 4, 11 / 5) * 0.0254)
 
 
-def test_capture_toml_describes_a_board_too(tmp_path: Path) -> None:
+def test_a_board_may_be_described_in_capture_toml(tmp_path: Path) -> None:
     (tmp_path / "capture.toml").write_text("[board]\ncolumns = 7\nrows = 6\nsquare_m = 0.1\n")
     assert read_board(tmp_path) == Board(columns=7, rows=6, square_m=0.1)
 
@@ -89,7 +89,7 @@ def test_bad_descriptions_are_refused(table: str, message: str, tmp_path: Path) 
         read_board(tmp_path)
 
 
-def test_endless_numbers_of_caliscope_are_refused(tmp_path: Path) -> None:
+def test_overlong_numbers_in_charuco_toml_are_refused(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO.replace("= 5.4", "= " + "1" * 400))
     with pytest.raises(InputError, match=r"charuco\.toml: board: .* is missing or not a number") as refusal:
         read_board(tmp_path)
@@ -97,7 +97,7 @@ def test_endless_numbers_of_caliscope_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_charuco_corners_lie_on_the_edges_of_pixels(inverted: bool) -> None:
+def test_charuco_corners_lie_between_pixels(inverted: bool) -> None:
     """Corners lie between pixels 60 + 40 k - 1 and 60 + 40 k, whose centres are integers: at 59.5 + 40 k."""
     board = Board(columns=4, rows=5, square_m=0.054, dictionary="DICT_4X4_1000", inverted=inverted)
     found = BoardDetector(board).corners_px(charuco_picture(inverted))
@@ -107,7 +107,7 @@ def test_charuco_corners_lie_on_the_edges_of_pixels(inverted: bool) -> None:
 
 
 @pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
-def test_a_checkerboards_first_corner_stays_the_first(quarter_turns: int) -> None:
+def test_the_first_corner_of_a_checkerboard_is_the_same_at_any_rotation(quarter_turns: int) -> None:
     picture = checkerboard_picture(6, 5)
     found = BoardDetector(Board(columns=6, rows=5, square_m=0.1)).corners_px(np.rot90(picture, quarter_turns).copy())
     grid = np.array([[59.5 + 40 * x, 59.5 + 40 * y] for y in (1, 2, 3, 4) for x in (1, 2, 3, 4, 5)])
@@ -118,8 +118,8 @@ def test_a_checkerboards_first_corner_stays_the_first(quarter_turns: int) -> Non
     assert np.abs(found - grid).max() < 0.25
 
 
-def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
-    """cam_0 has no image with sync_index 11; the board is in its last image, and in none of cam_1."""
+def test_the_table_of_timestamps_reveals_dropped_frames(tmp_path: Path) -> None:
+    """cam_0 has no image with sync_index 11; the board is in its last image only, and in none of cam_1."""
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     root = tmp_path / "calibration" / "extrinsic"
     blank = np.full((240, 320, 3), 128, np.uint8)
@@ -142,7 +142,7 @@ def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
     [(f"{'1' * 200_000},0\n", r"not a table \(field larger"), ("1,1\n" * 500_000, "2000018 bytes are too many")],
     ids=["an endless field", "more than 2 MB"],
 )
-def test_a_table_without_end_is_refused(rows: str, message: str, tmp_path: Path) -> None:
+def test_an_oversized_table_of_timestamps_is_refused(rows: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     write_image(tmp_path / "calibration" / "extrinsic" / "cam_0" / "0.png", np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "calibration" / "extrinsic" / "timestamps.csv").write_text(f"sync_index,cam_id\n{rows}")
@@ -150,7 +150,7 @@ def test_a_table_without_end_is_refused(rows: str, message: str, tmp_path: Path)
         read_board_footage(tmp_path, "extrinsic")
 
 
-def test_footage_with_a_suffix_in_upper_case_is_not_left_out(tmp_path: Path) -> None:
+def test_footage_with_an_upper_case_suffix_is_read(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     for name in ("cam_0.mp4", "cam_1.MP4"):
         rec.write_video(tmp_path / "video.mp4", 2)
@@ -160,7 +160,7 @@ def test_footage_with_a_suffix_in_upper_case_is_not_left_out(tmp_path: Path) -> 
     assert footage is not None and list(footage.corners_px) == ["cam_0", "cam_1"]
 
 
-def test_what_caliscope_leaves_beside_the_footage_is_no_camera(
+def test_caliscopes_output_folder_next_to_the_footage_is_not_a_camera(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
@@ -173,7 +173,7 @@ def test_what_caliscope_leaves_beside_the_footage_is_no_camera(
     assert "CHARUCO: no JPEG or PNG images, and not read" in caplog.text
 
 
-def test_videos_of_other_lengths_are_refused(tmp_path: Path) -> None:
+def test_footage_of_different_lengths_is_refused(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     for camera, count in {"cam_0": 3, "cam_1": 4}.items():
         rec.write_video(tmp_path / "calibration" / "extrinsic" / f"{camera}.mp4", count)
@@ -191,7 +191,7 @@ def test_links_in_the_footage_are_refused(tmp_path: Path) -> None:
         read_board_footage(tmp_path / "capture", "extrinsic")
 
 
-def test_a_wanted_frame_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_a_requested_frame_that_is_missing_is_refused(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     rec.write_video(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4", 3)
     with pytest.raises(InputError, match="extrinsic: has no frame 3; name one of 0 to 2"):
@@ -210,8 +210,8 @@ def test_long_footage_is_sampled_evenly(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(Video.open(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4").frames) == 10
 
 
-def test_ingest_keeps_the_corners_in_the_pixels_it_writes(tmp_path: Path) -> None:
-    """At half the size x becomes x / 2 - 1 / 4."""
+def test_ingested_board_corners_are_in_pixels_of_the_shrunk_images(tmp_path: Path) -> None:
+    """At half the size, x becomes x / 2 - 1 / 4."""
     folder = rec.write_easymocap(tmp_path / "ada")
     for name in ("images", "openpose"):
         shutil.rmtree(folder / name)

@@ -1,4 +1,4 @@
-"""Footage in step: clocks, frame rates, uneven rates, rotation."""
+"""Synchronised footage: clocks, frame rates, uneven rates, rotation."""
 
 import shutil
 from pathlib import Path
@@ -34,23 +34,23 @@ def test_a_drift_moves_later_frames_by_hand() -> None:
     footage = {"a": images("a", 1001, 10), "b": images("b", 1001, 10)}
     found = in_step(footage, {"a": Clock(), "b": Clock(0.0, 1.0001)}, 30)
     assert isinstance(found["b"], InStep)
-    assert found["b"].own[900] == pytest.approx(900.09)  # 90 s x 100 ppm = 9 ms, of frames of 100 ms
+    assert found["b"].own[900] == pytest.approx(900.09)  # 90 s x 100 ppm = 9 ms; a frame is 100 ms
 
 
-def test_the_slowest_cameras_own_drift_is_taken_out_by_hand() -> None:
-    """a's frame 900 is 90 s by its clock, which is 100 ppm fast: 90 / 1.0001 s, so many frames of b at 20 a second."""
+def test_the_drift_of_the_slowest_camera_is_removed_by_hand() -> None:
+    """a's frame 900 is at 90 s by its clock, which is 100 ppm fast: at 90 / 1.0001 s. b has 20 frames a second."""
     footage = {"a": images("a", 1001, 10), "b": images("b", 2001, 20)}
     found = in_step(footage, {"a": Clock(0.0, 1.0001), "b": Clock()}, 30)
     assert isinstance(found["b"], InStep)
     assert found["b"].own[900] == pytest.approx(1800 / 1.0001, abs=1e-6)
 
 
-def test_nothing_changes_without_clocks_at_even_rates() -> None:
+def test_footage_at_even_rates_without_clocks_is_unchanged() -> None:
     footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
     assert in_step(footage, {}, 30) == footage
 
 
-def test_images_that_are_missing_are_not_replaced_by_others() -> None:
+def test_missing_images_are_not_replaced_by_images_of_another_time() -> None:
     whole, gap = images("a", 20, 10), images("b", 20, 10)
     for frame in (5, 6, 7):
         del gap.files[frame]
@@ -58,17 +58,17 @@ def test_images_that_are_missing_are_not_replaced_by_others() -> None:
     assert found["a"].frames == (*range(5), *range(8, 20))  # at instant 7, b's nearest image is 0.06 s away
 
 
-def test_frames_that_come_unevenly_are_all_taken_and_none_for_another() -> None:
+def test_uneven_frames_are_all_used_and_none_replaces_a_dropped_one() -> None:
     video = Video(Path("b"), (0, 1, 2, 3, 4, 5), None, (0.0, 0.1, 0.21, 0.3, 0.6, 0.7))  # two dropped after 0.3 s
     found = in_step({"a": images("a", 7, 10), "b": video}, {"a": Clock(), "b": Clock(0.04)}, 30)
     assert isinstance(found["b"], InStep)  # a's instants 4 and 5 are 0.44 and 0.54 s: 0.14 and 0.06 s from a frame
     assert found["b"].own == pytest.approx({0: 0.4, 1: 1 + 4 / 11, 2: 2 + 3 / 9, 3: 3 + 4 / 30, 6: 4.4})
 
 
-def test_frames_that_come_evenly_are_counted_rather_than_others_of_that_rate() -> None:
+def test_of_equally_slow_cameras_one_with_even_frames_sets_the_instants() -> None:
     video = Video(Path("a"), (0, 1, 2, 3, 4), None, (0.0, 0.1, 0.2, 0.3, 0.6))
     found = in_step({"a": video, "b": images("b", 7, 10)}, {}, 30)
-    assert found["a"].frames == (0, 1, 2, 3, 6)  # of b; a's frame 4 is at 0.6 s
+    assert found["a"].frames == (0, 1, 2, 3, 6)  # b's numbers; a's frame 4 is at 0.6 s
 
 
 def test_recordings_that_do_not_overlap_and_missing_clocks_are_refused() -> None:
@@ -79,7 +79,7 @@ def test_recordings_that_do_not_overlap_and_missing_clocks_are_refused() -> None
         in_step(footage, {"a": Clock()}, 30)
 
 
-def test_a_clock_outside_the_table_of_a_camera_is_named(tmp_path: Path) -> None:
+def test_a_clock_outside_a_cameras_table_is_refused(tmp_path: Path) -> None:
     (tmp_path / "clocks.toml").write_text("offset_s = 1.0\n")
     with pytest.raises(InputError, match=r"clocks\.toml: offset_s is no table"):
         read_clocks(tmp_path)
@@ -99,7 +99,7 @@ def ingested(folder: Path, out: Path) -> Capture:
     return ingest(folder, CaptureSettings(), out, Uncalibrated(folder))
 
 
-def test_videos_are_ingested_in_step(tmp_path: Path) -> None:
+def test_videos_are_ingested_synchronised(tmp_path: Path) -> None:
     folder = tmp_path / "film"
     write_video(folder / "a.mp4", [10 * k for k in range(20)])
     write_video(folder / "b.mp4", [10 * k for k in range(15)])
@@ -107,12 +107,12 @@ def test_videos_are_ingested_in_step(tmp_path: Path) -> None:
         ingested(folder, tmp_path / "refused")
     (folder / "clocks.toml").write_text("[a]\noffset_s = 0.08\n[b]\n")  # two frames later on a's clock
     capture = ingested(folder, tmp_path / "out")
-    assert capture.frames == tuple(range(2, 17))  # of a, which is as slow as b and comes first
+    assert capture.frames == tuple(range(2, 17))  # a's frames: it is as slow as b and comes first
     levels = [[int(capture.image(name, frame)[20, 20].mean()) for name in "ab"] for frame in (2, 7, 14)]
     assert np.allclose(levels, [[20, 0], [70, 50], [140, 120]], atol=4.5)
 
 
-def test_frames_at_an_uneven_rate_are_taken_by_their_times(tmp_path: Path) -> None:
+def test_frames_at_an_uneven_rate_are_matched_by_time(tmp_path: Path) -> None:
     folder = tmp_path / "film"
     write_video(folder / "a.mp4", [10 * k for k in range(20)])
     write_video(folder / "b.mp4", [10 * k for k in range(20)])
@@ -122,13 +122,13 @@ def test_frames_at_an_uneven_rate_are_taken_by_their_times(tmp_path: Path) -> No
     capture = ingested(folder, tmp_path / "out")
     level = int(capture.image("b", capture.frames[-1])[20, 20].mean())
     other = int(capture.image("a", capture.frames[-1])[20, 20].mean())
-    assert abs(level - other) < 60  # by count they would be of one level, and 0.2 s apart
+    assert abs(level - other) < 60  # matched by number they would have one level, and be 0.2 s apart
     last_s = 0.04 * round(other / 10)
     assert abs(last_s - times_s[round(level / 10)]) <= 0.041  # half of the longer frame duration
 
 
-def test_the_rate_is_that_of_the_camera_whose_frames_are_counted(tmp_path: Path) -> None:
-    """Of 15 frames, the last five of b last twice as long, 19 a second on average; a's 25 a second are counted."""
+def test_the_frame_rate_is_that_of_the_camera_that_sets_the_instants(tmp_path: Path) -> None:
+    """The last five of b's 15 frames last twice as long: b has 19 a second on average. a has 25; its frames count."""
     write_video(tmp_path / "film" / "a.mp4", [10 * k for k in range(20)])
     write_video(tmp_path / "film" / "b.mp4", [10 * k for k in range(15)])
     hold_frames(tmp_path / "film" / "b.mp4", 10, 5)
@@ -136,9 +136,9 @@ def test_the_rate_is_that_of_the_camera_whose_frames_are_counted(tmp_path: Path)
     assert ingested(tmp_path / "film", tmp_path / "out").fps == pytest.approx(25)
 
 
-def test_a_stated_rate_contradicts_no_slowest_video(tmp_path: Path) -> None:
-    """a has 25 frames a second, b 50: a's are counted. Only what all videos have in common can be corrected: 25 may be
-    the rate at which both show what they filmed at 100."""
+def test_a_stated_rate_must_not_contradict_the_slowest_video(tmp_path: Path) -> None:
+    """a has 25 frames a second, b 50: a's frames count. A stated rate can correct only one that all videos share: 25
+    may be the rate at which both show what they filmed at 100."""
     folder = tmp_path / "film"
     write_video(folder / "a.mp4", [10 * k for k in range(10)])
     write_video(folder / "b.mp4", [5 * k for k in range(20)], fps=50)
@@ -154,8 +154,8 @@ def test_a_stated_rate_contradicts_no_slowest_video(tmp_path: Path) -> None:
     assert ingested(folder, tmp_path / "out").fps == 100
 
 
-def test_a_stated_rate_is_that_of_images_beside_a_slower_video(tmp_path: Path) -> None:
-    """Five images at 50 a second begin and end with three frames of the video, at 25."""
+def test_a_stated_rate_applies_to_images_next_to_a_slower_video(tmp_path: Path) -> None:
+    """Five images at 50 a second span the same time as three frames of the video at 25."""
     folder = write_easymocap(tmp_path / "film")
     shutil.rmtree(folder / "openpose")
     shutil.rmtree(folder / "images" / "02")
@@ -166,8 +166,8 @@ def test_a_stated_rate_is_that_of_images_beside_a_slower_video(tmp_path: Path) -
     assert (capture.frames, capture.fps) == ((0, 1, 2), 25)
 
 
-def test_a_lone_video_at_an_uneven_rate_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Of 20 frames of 40 ms, the last ten last twice as long; after ten, 0.4 s, an even rate has 0.6 s."""
+def test_a_single_video_at_an_uneven_rate_gets_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Of 20 frames of 40 ms, the last ten last twice as long: ten take 0.4 s, but at an even rate, 0.6 s."""
     write_video(tmp_path / "film" / "a.mp4", [10 * k for k in range(20)])
     ingest(tmp_path / "film", CaptureSettings(), tmp_path / "even")
     assert "off an even rate" not in caplog.text
@@ -182,4 +182,4 @@ def test_a_rotation_in_the_metadata_is_honoured(tmp_path: Path) -> None:
     rotate(video)
     upright = next(Video.open(video).read([0])).rgb
     assert upright.shape[:2] == (96, 64)
-    assert upright[:40].mean() > 150 and upright[56:].mean() < 20  # what was left is above
+    assert upright[:40].mean() > 150 and upright[56:].mean() < 20  # the left half is now on top

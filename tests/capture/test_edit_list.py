@@ -20,8 +20,8 @@ def video(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("wide", [False, True])
-def test_frames_outside_the_edit_list_are_not_there(video: Path, wide: bool) -> None:
-    """The third to the sixth of eight, which begin in the middle of what one key frame leads."""
+def test_frames_outside_the_edit_list_are_left_out(video: Path, wide: bool) -> None:
+    """Of eight frames, the third to the sixth are shown; they begin in the middle of a group of pictures."""
     trim(video, (2, 4), wide=wide)
     opened = Video.open(video)
     assert opened.frames == (0, 1, 2, 3)
@@ -30,15 +30,15 @@ def test_frames_outside_the_edit_list_are_not_there(video: Path, wide: bool) -> 
     assert levels == pytest.approx(LEVELS[2:6], abs=6)
 
 
-def test_several_edits_and_a_gap(video: Path) -> None:
-    """Nothing for the time of two frames, then the first three, then the last two."""
+def test_several_edits_after_a_gap_are_followed(video: Path) -> None:
+    """Nothing is shown for two frames, then the first three, then the last two."""
     trim(video, (None, 2), (0, 3), (6, 2))
     levels = [np.median(one.rgb[:, :40]) for one in Video.open(video).read(range(5))]
     assert levels == pytest.approx(LEVELS[:3] + LEVELS[6:], abs=6)
 
 
 def test_a_trimmed_video_that_is_cut_short_is_refused(video: Path) -> None:
-    """Of the six frames that are shown, the last is lost."""
+    """The last of the six frames that are shown is lost."""
     trim(video, (2, 6))
     content = bytearray(video.read_bytes())
     sizes_end = content.index(b"stco") - 4
@@ -48,7 +48,7 @@ def test_a_trimmed_video_that_is_cut_short_is_refused(video: Path) -> None:
         Video.open(video)
 
 
-def test_an_empty_header_shows_everything(video: Path) -> None:
+def test_all_frames_are_shown_if_the_header_is_empty(video: Path) -> None:
     trim(video, (2, 4))
     content = bytearray(video.read_bytes())
     where = content.index(b"mvhd")
@@ -73,7 +73,7 @@ def test_an_empty_header_shows_everything(video: Path) -> None:
         (b"mdhd", 0, 0),
     ],
 )
-def test_an_edit_list_that_makes_no_sense_shows_everything(video: Path, kind: bytes, at: int, number: int) -> None:
+def test_all_frames_are_shown_if_the_edit_list_is_invalid(video: Path, kind: bytes, at: int, number: int) -> None:
     trim(video, (2, 4))
     content = bytearray(video.read_bytes())
     where = content.index(kind) + at

@@ -78,7 +78,7 @@ def test_capture_toml_names_and_splits(folder: Path, tmp_path: Path) -> None:
     assert {p.name[:6] for p in (tmp_path / "out" / "images" / "01").iterdir()} == {"000001", "000003", "000004"}
 
 
-def test_what_is_of_no_calibrated_camera_is_told(
+def test_files_of_uncalibrated_cameras_get_a_warning(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING, "hnerf.capture"):
@@ -98,13 +98,13 @@ def test_what_is_of_no_calibrated_camera_is_told(
     ]
 
 
-def test_a_folder_of_plates_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_in_place_of_a_clean_plate_is_refused(folder: Path, tmp_path: Path) -> None:
     write_image(folder / "background" / "01" / "000000.png", rec.picture("01", 0))
     with pytest.raises(InputError, match=r"background/01: a folder; give one clean plate a camera, as 01\.png beside"):
         ingest(folder, SETTINGS, tmp_path / "out")
 
 
-def test_long_recordings_are_strided_evenly_and_it_is_told(
+def test_long_recordings_are_strided_evenly_and_this_is_logged(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.INFO, "hnerf.capture"):
@@ -115,10 +115,10 @@ def test_long_recordings_are_strided_evenly_and_it_is_told(
         assert "frames taken" not in caplog.text
 
 
-def test_frames_before_anybody_walks_in_and_after_are_left_out(
+def test_frames_before_and_after_anybody_is_seen_are_left_out(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Camera 02 sees somebody in frames 1 and 3 only, camera 01 in none: 0 and 4 are dropped, the gap at 2 stays."""
+    """Camera 02 sees somebody in frames 1 and 3 only, camera 01 in none: 0 and 4 are dropped; 2, in between, stays."""
     for camera, empty in (("01", rec.FRAMES), ("02", (0, 2, 4))):
         for frame in empty:
             rec.write_keypoints(folder / "openpose" / camera / f"{frame:06d}_keypoints.json", [])
@@ -142,7 +142,7 @@ def test_keypoints_hold_all_people_in_frame_order(folder: Path, tmp_path: Path) 
     assert not keypoints[[0, 1, 3, 4], 1].any()
 
 
-def test_shrinking_takes_camera_keypoints_and_masks_along(folder: Path, tmp_path: Path) -> None:
+def test_shrinking_also_scales_cameras_keypoints_and_masks(folder: Path, tmp_path: Path) -> None:
     mask = np.zeros((rec.HEIGHT, rec.WIDTH), np.uint8)
     mask[:8, :12] = 1  # not 255: anything but black is the person
     for camera in rec.CAMERAS:
@@ -158,8 +158,8 @@ def test_shrinking_takes_camera_keypoints_and_masks_along(folder: Path, tmp_path
     assert shrunk is not None and shrunk[:5, :8].all() and not shrunk[6:].any() and not shrunk[:, 8:].any()
 
 
-def test_masks_in_a_jpeg_do_not_grow(folder: Path, tmp_path: Path) -> None:
-    """Beside an edge, hardly any pixel of a JPEG is exactly black."""
+def test_jpeg_masks_do_not_grow(folder: Path, tmp_path: Path) -> None:
+    """Next to an edge, hardly any pixel of a JPEG is exactly black."""
     mask = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
     mask[3:13, 5:19] = 255
     for camera in rec.CAMERAS:
@@ -170,9 +170,9 @@ def test_masks_in_a_jpeg_do_not_grow(folder: Path, tmp_path: Path) -> None:
     assert found is not None and np.array_equal(found, mask[..., 0] > 0)
 
 
-def test_mattes_are_cut_in_the_middle_of_their_edges_and_labels_are_not(folder: Path, tmp_path: Path) -> None:
-    """Camera 01 has mattes, with a ramp of 3 px beside the person: only one has more levels, in another corner. Camera
-    02 has labels, of which 1 is the person."""
+def test_mattes_are_thresholded_in_the_middle_but_labels_at_zero(folder: Path, tmp_path: Path) -> None:
+    """Camera 01 has mattes with a ramp of 3 px next to the person; only one of them has many levels, elsewhere in the
+    image. Camera 02 has labels; label 1 is the person."""
     matte, labels = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8), np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
     matte[3:13, 5:19], labels[3:13, 5:19] = 255, 1
     matte[3:13, 19:22] = np.array([190, 120, 60])[:, None]
@@ -188,7 +188,7 @@ def test_mattes_are_cut_in_the_middle_of_their_edges_and_labels_are_not(folder: 
         assert hard is not None and np.array_equal(hard, labels[..., 0] > 0)
 
 
-def test_distorted_recording_comes_out_linear(folder: Path, tmp_path: Path) -> None:
+def test_a_distorted_recording_is_undistorted(folder: Path, tmp_path: Path) -> None:
     """k1 = -0.5: what the lens shows at radius r (1 - 0.5 r^2) belongs at radius r."""
     rec.write_calibration(folder, distortion=(-0.5, 0, 0, 0))
     # At r = 0.4 the lens shows 0.4 (1 - 0.5 * 0.16) = 0.368: 20 px * 0.368 = 7.36 px right of 11.5.
@@ -203,11 +203,11 @@ def test_distorted_recording_comes_out_linear(folder: Path, tmp_path: Path) -> N
     assert keypoints is not None and keypoints[0, 0, 0] == pytest.approx([11.5 + 8.0, 7.5, 0.9], abs=1e-3)
     # Pixel (19, 7): x = 7.5 / 20, r^2 = 0.375^2 + 0.025^2; shown at 11.5 + 7.5 (1 - 0.5 r^2), on a ramp of 10 a pixel.
     expected = 10 * (11.5 + 7.5 * (1 - 0.5 * (0.375**2 + 0.025**2)))
-    assert capture.image("01", 0)[7, 19] == pytest.approx([expected] * 3, abs=2.5)  # remap's 1/32 px, and JPEG
+    assert capture.image("01", 0)[7, 19] == pytest.approx([expected] * 3, abs=2.5)  # remap rounds to 1/32 px; JPEG
     assert np.array_equal(capture.cameras["01"].K, np.array(rec.K))
 
 
-def test_clean_plates_come_along(folder: Path, tmp_path: Path) -> None:
+def test_clean_plates_are_ingested(folder: Path, tmp_path: Path) -> None:
     write_image(folder / "background" / "01.png", rec.picture("01", 99))
     capture = ingest(folder, SETTINGS, tmp_path / "out")
     plate = capture.background("01")
@@ -216,8 +216,8 @@ def test_clean_plates_come_along(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", ["W_01: 24\n", "H_01: 16\n"])
-def test_one_side_of_a_calibrated_picture_is_one_line(line: str, folder: Path, tmp_path: Path) -> None:
-    """Without the other it would be dropped, whatever size the pictures have."""
+def test_a_calibrated_size_with_one_side_missing_is_refused(line: str, folder: Path, tmp_path: Path) -> None:
+    """Otherwise it would be ignored, and images of any size would be accepted."""
     text = (folder / "intri.yml").read_text()
     assert line in text
     (folder / "intri.yml").write_text(text.replace(line, ""))
@@ -225,7 +225,7 @@ def test_one_side_of_a_calibrated_picture_is_one_line(line: str, folder: Path, t
         ingest(folder, SETTINGS, tmp_path / "out")
 
 
-def test_padding_within_two_percent_is_let_through_and_reported(folder: Path, tmp_path: Path) -> None:
+def test_padding_within_two_percent_is_accepted_and_recorded(folder: Path, tmp_path: Path) -> None:
     text = (folder / "intri.yml").read_text()
     (folder / "intri.yml").write_text(text.replace("W_01: 24", "W_01: 240").replace("H_01: 16", "H_01: 160"))
     for frame in rec.FRAMES:
@@ -243,14 +243,14 @@ def test_grey_images_with_alpha_are_read(folder: Path, tmp_path: Path) -> None:
     assert np.array_equal(grey[..., 0], grey[..., 1])
 
 
-def test_a_mark_of_utf_8_is_no_content(folder: Path, tmp_path: Path) -> None:
+def test_a_utf_8_byte_order_mark_is_ignored(folder: Path, tmp_path: Path) -> None:
     (folder / "capture.toml").write_text('name = "ada"', encoding="utf-8-sig")
     path = folder / "openpose" / "01" / "000000_keypoints.json"
     path.write_text(path.read_text(), encoding="utf-8-sig")
     assert ingest(folder, SETTINGS, tmp_path / "out").name == "ada"
 
 
-def test_suffixes_may_be_in_upper_case(tmp_path: Path) -> None:
+def test_file_suffixes_may_be_in_upper_case(tmp_path: Path) -> None:
     for write in (rec.write_easymocap, rec.write_pose2sim):
         folder = write(tmp_path / write.__name__)
         for path in [*folder.glob("openpose/*/*"), *folder.glob("pose/*/*"), *folder.glob("videos/*")]:
@@ -259,14 +259,14 @@ def test_suffixes_may_be_in_upper_case(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("prefix", ["", "clip_07_"])
-def test_keypoints_may_be_called_as_openpose_calls_them(folder: Path, tmp_path: Path, prefix: str) -> None:
+def test_keypoint_files_may_have_the_names_that_openpose_gives_them(folder: Path, tmp_path: Path, prefix: str) -> None:
     plain = ingest(folder, SETTINGS, tmp_path / "plain").keypoints("01")
     for path in folder.glob("openpose/*/*"):
         path.rename(path.with_name(f"{prefix}{int(path.stem[:6]):012d}_keypoints.json"))
     assert np.array_equal(ingest(folder, SETTINGS, tmp_path / "out").keypoints("01"), plain)
 
 
-def test_numbers_without_zeros_before_them_are_sorted_as_numbers(tmp_path: Path) -> None:
+def test_numbers_without_leading_zeros_are_sorted_as_numbers(tmp_path: Path) -> None:
     folder = rec.write_pose2sim(tmp_path / "walker")
     for path in (folder / "pose" / "cam01_json").iterdir():
         path.rename(path.with_stem(f"cam01_{int(path.stem[-6:]) + 5}"))  # 5 to 14
@@ -284,14 +284,14 @@ def test_videos_are_read_by_frame(tmp_path: Path) -> None:
         assert capture.image("cam02", frame).mean() == pytest.approx(20 + 20 * frame, abs=3)
 
 
-def test_shared_captures_come_through(wave: Capture) -> None:
+def test_a_shared_capture_is_ingested_unchanged(wave: Capture) -> None:
     assert (len(wave.train_frames), len(wave.novel_pose_frames)) == (24, 12)
     image = cv2.imread(str(shared_capture("valid-wave") / "images" / "05" / "000035.jpg"))[..., ::-1]
     assert np.array_equal(wave.image("05", 35), image)
 
 
-def test_the_distance_of_recorded_frames_is_kept(folder: Path, tmp_path: Path) -> None:
-    """Frames 0 to 4 are called 0, 3, 6, 9 and 12; of these, capture.toml chooses the first and the last."""
+def test_the_step_between_recorded_frame_numbers_is_kept(folder: Path, tmp_path: Path) -> None:
+    """Frames 0 to 4 are renumbered 0, 3, 6, 9 and 12; of these, capture.toml chooses the first and the last."""
     for path in sorted([*folder.glob("images/*/*"), *folder.glob("openpose/*/*")], reverse=True):
         path.rename(path.with_name(f"{3 * int(path.name[:6]):06d}{path.name[6:]}"))
     (folder / "capture.toml").write_text("[frames]\ntrain = [0, 12]\n")
@@ -300,8 +300,8 @@ def test_the_distance_of_recorded_frames_is_kept(folder: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("form", ["NFC", "NFD"])
-def test_accents_are_the_same_composed_or_not(tmp_path: Path, form: Literal["NFC", "NFD"]) -> None:
-    """macOS takes them apart in the names of files, editors compose them, or the other way round."""
+def test_accents_in_names_may_be_composed_or_decomposed(tmp_path: Path, form: Literal["NFC", "NFD"]) -> None:
+    """macOS decomposes them in file names, editors compose them, or the other way round."""
     folder = rec.write_easymocap(tmp_path / "ada")
     other: Literal["NFC", "NFD"] = "NFD" if form == "NFC" else "NFC"
     written, named = (unicodedata.normalize(one, "K\u00e4te") for one in (form, other))

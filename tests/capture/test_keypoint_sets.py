@@ -37,37 +37,37 @@ FEET: dict[KeypointSetName, list[float]] = {  # left big toe, small toe, heel, t
 
 
 @pytest.mark.parametrize("name", FEET)
-def test_sets_that_begin_with_coco(name: KeypointSetName) -> None:
+def test_sets_that_begin_with_coco_are_converted(name: KeypointSetName) -> None:
     found = converted(SETS[name].points, name)
     assert found[:, 0].tolist() == COCO_BODY + FEET[name]
     assert found[:, 1].tolist() == pytest.approx([100 * x for x in COCO_BODY + FEET[name]])
-    feet = [0.5 + x / 1000 if x else 0 for x in FEET[name]]  # a foot that the set has not has no confidence
+    feet = [0.5 + x / 1000 if x else 0 for x in FEET[name]]  # a foot point that the set lacks has no confidence
     lower = [0.5 + int(x) / 1000 for x in COCO_BODY]  # a mean has the lower of its two confidences
     assert found[:, 2].tolist() == pytest.approx(lower + feet)
 
 
-def test_openpose_coco_and_body_25() -> None:
+def test_openpose_coco_and_body_25_are_converted() -> None:
     assert converted(18)[:, 0].tolist() == [*range(8), 9.5, *range(8, 18)] + [0] * 6
     assert np.array_equal(converted(25, "body_25"), points(25))
 
 
 @pytest.mark.parametrize("count", [17, 18, 26, 133, 136])
-def test_the_number_of_points_tells_the_set(count: int) -> None:
+def test_the_number_of_points_identifies_the_set(count: int) -> None:
     (name,) = (name for name, known in SETS.items() if known.points == count)
     assert np.array_equal(converted(count), converted(count, name))
 
 
 def person(face: slice, others: slice) -> np.ndarray:
-    """Return keypoints (25, 3) of a person whose face is 1 px wide, and whose `others` lie 3 px apart."""
+    """Return keypoints (25, 3) of a person whose points `face` span 1 px, and whose points `others` are 3 px apart."""
     keypoints = np.ones((25, 3))
     keypoints[face, 0], keypoints[others, 0] = [5, 6, 5, 6], [0, 3, 6, 9]
     return keypoints
 
 
-def test_where_the_face_is_tells_sets_of_25_apart() -> None:
+def test_sets_of_25_points_are_told_apart_by_which_points_are_the_face() -> None:
     body_25, body_25b = person(slice(15, 19), slice(1, 5)), person(slice(1, 5), slice(15, 19))
     assert is_body_25(body_25) and not is_body_25(body_25b)
-    assert is_body_25(np.zeros((25, 3)))  # nobody seen: the commoner of the two
+    assert is_body_25(np.zeros((25, 3)))  # nobody is seen: the more common of the two
     one_ear = np.zeros((25, 3))
     one_ear[4] = body_25b[4]
     assert is_body_25(one_ear)  # a single point has no extent
@@ -77,7 +77,7 @@ def test_where_the_face_is_tells_sets_of_25_apart() -> None:
     assert to_body_25(seen_by_one, None)["01"][0, 0, 8].tolist() == [5, 5, 1]
 
 
-def test_a_person_from_above_keeps_the_order() -> None:
+def test_a_person_seen_from_above_is_recognised_as_body_25() -> None:
     """From above, hidden hips are guessed: the mid-hip lies off their middle by a third of the distance to the nose."""
     body_25 = person(slice(15, 19), slice(1, 5))
     body_25[[0, 8, 9, 12], :2] = [[5, 1], [5, 6], [3, 4], [7, 4]]
@@ -91,12 +91,12 @@ def test_a_mean_needs_both_points() -> None:
     assert found[1].tolist() == [0, 0, 0] and found[5, 0] == 5
 
 
-def test_a_camera_that_sees_nobody_has_no_confidence() -> None:
+def test_a_camera_that_sees_nobody_gets_zero_confidence() -> None:
     found = to_body_25({"01": points(17)[None, None], "02": np.zeros((1, 1, 0, 3))}, "coco_17")
     assert found["02"].shape == (1, 1, 25, 3) and not found["02"].any()
 
 
-def test_a_named_set_of_another_size_is_bad_input() -> None:
+def test_a_named_set_of_another_size_is_refused() -> None:
     with pytest.raises(InputError, match=r'keypoints = "halpe_26" has 26 points, but camera 01 has 17'):
         converted(17, "halpe_26")
 
@@ -107,14 +107,14 @@ def test_an_unknown_number_of_points_names_the_known_sets(tmp_path: Path) -> Non
         read_openpose(tmp_path / "a.json")
 
 
-def test_people_without_points_are_nobody(tmp_path: Path) -> None:
+def test_people_without_points_are_left_out(tmp_path: Path) -> None:
     people = [{}, {"pose_keypoints_2d": []}, {"pose_keypoints_2d": points(25).ravel().tolist()}]
     for count, kept in ((3, (1, 25, 3)), (2, (0, 0, 3))):
         (tmp_path / "a.json").write_text(json.dumps({"people": people[:count]}))
         assert read_openpose(tmp_path / "a.json").shape == kept
 
 
-def test_points_that_were_not_seen_may_lie_anywhere(tmp_path: Path) -> None:
+def test_points_that_were_not_seen_may_have_any_position(tmp_path: Path) -> None:
     """The mean of two shoulders at 1e308, one of them without confidence, would be infinite."""
     found = points(17)
     found[5:7, :2], found[5, 2] = 1e308, 0
@@ -151,7 +151,7 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
             read_results(tmp_path / "01.json", (0, 1, 3))
 
 
-def test_results_beside_the_images_come_through_the_door(tmp_path: Path) -> None:
+def test_lists_of_results_next_to_the_images_are_ingested(tmp_path: Path) -> None:
     folder = rec.write_easymocap(tmp_path / "person")
     for path in folder.glob("openpose/*/*.json"):
         path.unlink()

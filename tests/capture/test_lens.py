@@ -5,8 +5,8 @@ import pytest
 from hnerf.capture.lens import undistort_keypoints, undistort_points
 
 
-def test_undistortion_keeps_what_is_absent_absent() -> None:
-    """At radius 1 the lens pictures 1 + 0.1: pixel 50 + 110 is that of 50 + 100 without distortion."""
+def test_undistortion_keeps_missing_points_missing() -> None:
+    """The lens images radius 1 at 1 + 0.1: pixel 50 + 110 is pixel 50 + 100 without distortion."""
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
     flat = undistort_points(np.array([[[160.0, 50], [np.nan, np.nan]]]), K, np.array([0.1, 0, 0, 0]))
     assert flat[0, 0].tolist() == pytest.approx([150, 50], abs=0.01) and np.isnan(flat[0, 1]).all()
@@ -14,7 +14,7 @@ def test_undistortion_keeps_what_is_absent_absent() -> None:
 
 
 @pytest.mark.parametrize(("focal_px", "k1", "k2"), [(1100.0, -0.25, 0.05), (870.0, -0.25, 0), (1000.0, -0.2, 0)])
-def test_undistortion_of_a_wide_lens_comes_back_in_the_corners(focal_px: float, k1: float, k2: float) -> None:
+def test_undistortion_of_a_wide_lens_is_exact_in_the_corners(focal_px: float, k1: float, k2: float) -> None:
     K, distortion = np.array([[focal_px, 0, 960], [0, focal_px, 540], [0, 0, 1]]), np.array([k1, k2, 0, 0])
     straight = np.array([[220.5, 105], [1699.5, 975], [1700, 60], [960, 540], [200, 1000]])
     directions = np.c_[(straight - (960, 540)) / focal_px, np.ones(5)]
@@ -22,8 +22,8 @@ def test_undistortion_of_a_wide_lens_comes_back_in_the_corners(focal_px: float, 
     np.testing.assert_allclose(undistort_points(bent, K, distortion), straight, atol=0.01)
 
 
-def test_what_no_ray_reaches_is_absent() -> None:
-    """At radius r the lens pictures r (1 - 0.3 r^2): 0.4625 at 0.5, and at most 0.703, which 80 px of 100 exceed."""
+def test_keypoints_that_no_ray_reaches_are_missing() -> None:
+    """The lens images radius r at r (1 - 0.3 r^2): 0.5 at 0.4625, and nothing beyond 0.703; 0.8 is beyond that."""
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
     found = undistort_keypoints(np.array([[96.25, 50, 0.9], [130, 50, 0.9]]), K, np.array([-0.3, 0, 0, 0]))
     assert found[0].tolist() == pytest.approx([100, 50, 0.9], abs=0.01)

@@ -1,4 +1,4 @@
-"""Which lenses are read, and names of captures."""
+"""Which lenses are accepted, and how captures are named."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -12,13 +12,13 @@ from hnerf.errors import InputError
 
 
 @pytest.mark.parametrize(("skew", "k1", "refused"), [(12.0, -0.1, True), (1e-9, -0.1, False), (12.0, 0.0, False)])
-def test_skew_is_read_without_distortion_only(skew: float, k1: float, refused: bool) -> None:
+def test_skew_is_accepted_only_without_distortion(skew: float, k1: float, refused: bool) -> None:
     K, distortion = np.array([[800.0, skew, 499.5], [0, 800, 499.5], [0, 0, 1]]), np.array([k1, 0, 0, 0])
     source = Path("intri.yml")
     with pytest.raises(InputError, match=r"intri\.yml: camera a: has both skew") if refused else nullcontext():
         checked_lens((source, source), "a", K, distortion, np.eye(3), np.zeros(3), None)
 
 
-def test_a_folder_named_on_a_mac_has_the_same_name() -> None:
+def test_a_decomposed_folder_name_is_composed() -> None:
     composed, decomposed = "J\u00fcrgen", "Ju\u0308rgen"
     assert capture_name(Path("/recordings") / decomposed, CaptureManifest()) == composed

@@ -1,4 +1,4 @@
-"""Images of strangers: upright whatever their metadata say, and of bounded size."""
+"""Untrusted images are read upright whatever their metadata say, and their size is limited."""
 
 import struct
 from collections.abc import Callable
@@ -23,7 +23,7 @@ XMP = (
     b'<rdf:Description xmlns:tiff="http://ns.adobe.com/tiff/1.0/" tiff:Orientation="6"/></rdf:RDF></x:xmpmeta>'
 )
 STORED = rec.picture("01", 0)
-# By EXIF's orientation: where its row 0 and column 0 are seen.
+# By EXIF orientation, with the sides at which row 0 and column 0 are seen.
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda a: a,  # top, left
     2: lambda a: a[:, ::-1],  # top, right
@@ -37,7 +37,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def exif(*entries: tuple[int, int, int]) -> bytes:
-    """Return EXIF, most significant byte first, of entries (tag, type, number)."""
+    """Return big-endian EXIF with entries (tag, type, number)."""
     values = {SHORT: ">HHIH2x", LONG: ">HHII"}
     packed = b"".join(struct.pack(values[kind], tag, kind, 1, number) for tag, kind, number in entries)
     return b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">H", len(entries)) + packed + bytes(4)
@@ -49,8 +49,8 @@ def test_images_are_read_upright(orientation: int, tmp_path: Path) -> None:
     assert np.array_equal(read_image(tmp_path / "a.png"), UPRIGHT[orientation](STORED))
 
 
-def test_damaged_metadata_do_not_matter_and_xmp_neither(tmp_path: Path) -> None:
-    """A number in place of a description, which cannot be written again, leaves the orientation; nonsense is none."""
+def test_damaged_metadata_and_xmp_do_not_matter(tmp_path: Path) -> None:
+    """A number in place of a description cannot be written again, but the orientation is read. Nonsense is ignored."""
     odd, nonsense = exif((DESCRIPTION, SHORT, 7), (ORIENTATION, SHORT, 6)), exif((ORIENTATION, LONG, 1 << 31))
     for metadata, expected in ((odd, UPRIGHT[6](STORED)), (nonsense, STORED), (b"Exif\0\0MM", STORED)):
         Image.fromarray(STORED).save(tmp_path / "a.png", exif=metadata)
@@ -60,8 +60,8 @@ def test_damaged_metadata_do_not_matter_and_xmp_neither(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", [(ORIENTATION, SHORT, 6), (ORIENTATION, SHORT, 2), (ORIENTATION, LONG, 6)])
-def test_what_is_ingested_is_what_was_read(orientation: tuple[int, int, int], tmp_path: Path) -> None:
-    """OpenCV, which reads what is kept, applies EXIF itself, and does not know an orientation of another type."""
+def test_ingested_images_are_upright(orientation: tuple[int, int, int], tmp_path: Path) -> None:
+    """OpenCV, which reads ingested images, applies EXIF itself, and does not know an orientation of another type."""
     folder = rec.write_easymocap(tmp_path / "person")
     sizes = [line for line in (folder / "intri.yml").read_text().splitlines() if not line.startswith(("W_", "H_"))]
     (folder / "intri.yml").write_text("\n".join(sizes))
@@ -77,7 +77,7 @@ def test_what_is_ingested_is_what_was_read(orientation: tuple[int, int, int], tm
     ("mode", "colour", "lightest"), [("L", 0, 0), ("L", 90, 90), ("RGB", (0, 0, 0), 0), ("RGB", (7, 90, 0), 90)]
 )
 def test_the_mask_of_a_cut_out_is_its_opacity(mode: str, colour: object, lightest: int, tmp_path: Path) -> None:
-    """Whatever colours the person has, and the background that does not show. What is opaque is read by its colours."""
+    """Colours of the person and of the transparent background do not count. An opaque image is read by its colours."""
     opacity = np.zeros((8, 6), np.uint8)
     opacity[2:6, 1:4] = 200
     for alpha, expected in ((opacity, opacity), (np.full_like(opacity, 255), np.full_like(opacity, lightest))):
@@ -87,8 +87,8 @@ def test_the_mask_of_a_cut_out_is_its_opacity(mode: str, colour: object, lightes
         assert np.array_equal(read_mask(tmp_path / "a.png"), expected)
 
 
-def test_cut_outs_of_nobody_and_of_palettes(tmp_path: Path) -> None:
-    """Where the person has left, hidden colours do not count. A palette or a grey value may be what is transparent."""
+def test_empty_cut_outs_and_transparent_palette_entries_are_read(tmp_path: Path) -> None:
+    """If nobody is left, hidden colours do not count. A palette entry or a grey level may be transparent."""
     Image.new("RGBA", (6, 8), (9, 90, 9, 0)).save(tmp_path / "nobody.png")
     assert not read_mask(tmp_path / "nobody.png").any()
     shape = np.full((8, 6), 120, np.uint8)

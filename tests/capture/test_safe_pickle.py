@@ -35,7 +35,7 @@ def dumped(path: Path, value: object, protocol: int = 4) -> Path:
 
 
 @pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4])
-def test_plain_data_comes_back(tmp_path: Path, protocol: int) -> None:
+def test_plain_data_is_read(tmp_path: Path, protocol: int) -> None:
     found = read_pickle(dumped(tmp_path / "a.pkl", DATA, protocol))
     assert np.array_equal(found["K"][0], DATA["K"][0]) and np.array_equal(found["K"][1], DATA["K"][1])
     assert found["ims"].shape == (2,) and found["ims"][0] == {"ims": ["a", "b"]}
@@ -44,15 +44,15 @@ def test_plain_data_comes_back(tmp_path: Path, protocol: int) -> None:
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4])
-def test_sparse_matrices_come_back(tmp_path: Path, protocol: int) -> None:
+def test_sparse_matrices_are_read(tmp_path: Path, protocol: int) -> None:
     dense = np.array([[0.0, 2, 0], [1, 0, 0.5]])
     found = read_pickle(dumped(tmp_path / "a.pkl", {"J": scipy.sparse.csc_matrix(dense)}, protocol))
     assert np.array_equal(found["J"].toarray(), dense)
 
 
-def test_python_2_wrote_text_as_bytes(tmp_path: Path) -> None:
-    """Under Python 2 numpy names numpy.core.multiarray, and pickles bytes as text; 2.0 is 40 00 00 00 00 00 00 00, big
-    endian."""
+def test_arrays_pickled_by_python_2_are_read(tmp_path: Path) -> None:
+    """Under Python 2, numpy refers to numpy.core.multiarray and pickles bytes as text. 2.0 is 40 00 00 00 00 00 00 00,
+    big endian."""
     (tmp_path / "a.pkl").write_bytes(
         b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR"
         b"(I1\n(I1\ntcnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI0\ntbI00\n"
@@ -61,8 +61,8 @@ def test_python_2_wrote_text_as_bytes(tmp_path: Path) -> None:
     assert read_pickle(tmp_path / "a.pkl").tolist() == [2.0]
 
 
-def test_chumpy_arrays_become_plain(tmp_path: Path) -> None:
-    """The objects are built as chumpy's are stored: class, then attributes, of which x is the value; chumpy is not
+def test_chumpy_arrays_are_read_as_plain_arrays(tmp_path: Path) -> None:
+    """The pickle is built as chumpy's are: the class, then its attributes, of which x is the value. chumpy is not
     needed."""
     numbers = pickle.dumps(np.array([3.0, 4.0]), 2)[2:-1]  # without its PROTO and STOP
     stored = (
@@ -75,7 +75,7 @@ def test_chumpy_arrays_become_plain(tmp_path: Path) -> None:
         read_pickle(tmp_path / "a.pkl")
 
 
-def test_npy_files_of_one_dictionary(tmp_path: Path) -> None:
+def test_npy_files_of_one_dictionary_are_read(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", {"poses": np.ones((1, 72))}, allow_pickle=True)  # type: ignore[arg-type]
     assert read_pickled_npy(tmp_path / "a.npy")["poses"].shape == (1, 72)
     np.save(tmp_path / "b.npy", np.ones(3))
@@ -90,7 +90,7 @@ def _of_a_terabyte() -> bytes:
     return stored.replace(b"I2\n", b"I1000000000000\n")
 
 
-SHARED = b"2\x86" * 60  # makes what is on the stack a tuple of itself and itself, as often as that
+SHARED = b"2\x86" * 60  # 60 times, replaces the top of the stack by a tuple of it and itself
 
 BAD = {
     "a call": pickle.dumps({"cams": Bomb()}),
@@ -103,7 +103,7 @@ BAD = {
     "tuples for keys": b"\x80\x02}()" + SHARED + b"K\x01K\x02K\x03u.",
     "keys of a dictionary at once": b"()" + SHARED + b"K\x01d.",
     "a tuple for a type": b"\x80\x02cnumpy\ndtype\n)" + SHARED + b"\x85R.",
-    "more than it holds": _of_a_terabyte(),
+    "an array that declares more than it holds": _of_a_terabyte(),
     "cut short": pickle.dumps(DATA)[:300],
     "nested deeply": b"(" * 5000 + b"l" * 5000 + b".",
     "text": b"hello",
@@ -112,7 +112,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_no_plain_data_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_anything_but_plain_data_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.pkl").write_bytes(BAD[case])
     with pytest.raises(InputError, match=r"a\.pkl: not a pickle of plain data"):
@@ -126,7 +126,7 @@ def test_bytes_of_a_declared_length_are_not_allocated(tmp_path: Path) -> None:
         read_pickle(tmp_path / "a.pkl")
 
 
-def test_a_set_of_old_is_read_without_hashing(tmp_path: Path) -> None:
+def test_a_set_in_an_old_protocol_is_read_without_hashing(tmp_path: Path) -> None:
     (tmp_path / "a.pkl").write_bytes(b"\x80\x02}U\x01ac__builtin__\nset\n](" + b")" + SHARED + b"e\x85RsU\x01bK\x02s.")
     with pytest.raises(InputError, match="more than 10000000 items"):
         read_pickle(tmp_path / "a.pkl")
@@ -134,20 +134,20 @@ def test_a_set_of_old_is_read_without_hashing(tmp_path: Path) -> None:
 
 
 def nested_twice(levels: int) -> list[Any]:
-    """Return lists of which each holds the next twice: 2^levels leaves."""
+    """Return nested lists, each of which holds the next twice: 2^levels leaves."""
     nested: list[Any] = [np.ones(1)]
     for _ in range(levels):
         nested = [nested, nested]
     return nested
 
 
-def test_what_a_pickle_holds_often_is_made_once(tmp_path: Path) -> None:
+def test_an_object_that_a_pickle_holds_twice_is_made_once(tmp_path: Path) -> None:
     found = read_pickle(dumped(tmp_path / "a.pkl", nested_twice(20)))
     assert found[0] is found[1]
 
 
-def test_what_no_array_could_hold_is_refused(tmp_path: Path) -> None:
-    """10^12 numbers, if anyone made an array of it."""
+def test_nested_lists_too_large_for_an_array_are_refused(tmp_path: Path) -> None:
+    """An array of them would hold 10^12 numbers."""
     with pytest.raises(InputError, match="more than 10000000 items"):
         read_pickle(dumped(tmp_path / "a.pkl", {"camera_f": nested_twice(40)}))
 

@@ -1,4 +1,4 @@
-"""Who the subject is, among people whose places are known: passers-by, a poster, a mirror image."""
+"""Choice of the subject among people at known positions: passers-by, a poster, a mirror image."""
 
 import dataclasses
 from pathlib import Path
@@ -18,7 +18,7 @@ FRAMES, CONFIDENCE, NOISE_PX = 30, 0.8, 1.0
 
 
 def seen_by(camera: Camera, joints_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return detections (frames, 25, 3) of joints (frames, 25, 3): nobody where most are outside the image."""
+    """Return detections (frames, 25, 3) of joints (frames, 25, 3): zeros if most are outside the image."""
     uv, depth_m = camera.project(joints_m)
     noisy = uv + rng.normal(size=uv.shape) * NOISE_PX
     inside = ((noisy >= 0) & (noisy < camera.width_px)).all(-1) & (depth_m > 0)
@@ -27,7 +27,7 @@ def seen_by(camera: Camera, joints_m: np.ndarray, rng: np.random.Generator) -> n
 
 
 def recorded(root: Path, cameras: list[Camera], *people_m: np.ndarray) -> tuple[Capture, list[dict[str, np.ndarray]]]:
-    """Write a capture of people, each (frames, 25, 3) metres, whose order differs from image to image; return it, and
+    """Write a capture of people, each (frames, 25, 3) in metres, whose order differs from image to image. Return it and
     the detections of each person."""
     rng = np.random.default_rng(0)
     each = [{camera.name: seen_by(camera, joints_m, rng) for camera in cameras} for joints_m in people_m]
@@ -54,7 +54,7 @@ def staying(at_m: tuple[float, float]) -> np.ndarray:
 
 
 def share_right(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> float:
-    """Return the share of the images in which the person is, and is the one who was found."""
+    """Return the share of images in which the person was found, among those that show the person."""
     right = [
         np.array_equal(a, b)
         for name in expected
@@ -65,14 +65,14 @@ def share_right(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -
 
 
 @pytest.mark.parametrize("cameras", [1, 4])
-def test_a_stranger_who_crosses_is_not_taken(cameras: int, tmp_path: Path) -> None:
-    """He comes nearer to some cameras than the subject, and passes at 0.6 m from him."""
+def test_a_passer_by_is_not_taken_for_the_subject(cameras: int, tmp_path: Path) -> None:
+    """The passer-by comes nearer to some cameras than the subject, and passes the subject at 0.6 m."""
     capture, (subject, _) = recorded(tmp_path, ring(cameras), walk_m(FRAMES), walking((0.5, -2.5), (1.3, 2.5)))
     assert share_right(subject_keypoints(capture), subject) == 1
 
 
-def test_two_people_who_cross_keep_apart(tmp_path: Path) -> None:
-    """Both walk through the middle, at 0.4 m from each other; the second one comes late and leaves early."""
+def test_two_people_who_cross_are_told_apart(tmp_path: Path) -> None:
+    """Both walk through the middle, 0.4 m apart; the second comes late and leaves early."""
     first, second = walking((-1.2, -0.2), (1.2, -0.2)), walking((1.2, 0.2), (-1.2, 0.2))
     second[:5] = second[-5:] = 100.0  # elsewhere
     capture, (subject, other) = recorded(tmp_path, ring(4), first, second)
@@ -83,7 +83,7 @@ def test_two_people_who_cross_keep_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cameras", [1, 4])
-def test_a_poster_is_not_taken(cameras: int, tmp_path: Path) -> None:
+def test_a_poster_is_not_taken_for_the_subject(cameras: int, tmp_path: Path) -> None:
     """It hangs in the middle, larger than the subject, and never moves."""
     poster = np.repeat(1.15 * STANDING_M[None], FRAMES, 0)
     capture, (subject, _) = recorded(tmp_path, ring(cameras), staying((-0.9, 0.3)), poster)
@@ -91,16 +91,16 @@ def test_a_poster_is_not_taken(cameras: int, tmp_path: Path) -> None:
     assert [person.moves for person in ranked_people(capture)] == [True, False]
 
 
-def test_a_poster_alone_is_the_subject(tmp_path: Path) -> None:
-    """Nobody else is there: a person who stands still is one."""
+def test_a_motionless_person_alone_is_the_subject(tmp_path: Path) -> None:
+    """With nobody else there, it may be a person who stands still."""
     capture, (subject, _) = recorded(
         tmp_path, ring(3), np.repeat(STANDING_M[None], FRAMES, 0), np.full((FRAMES, 25, 3), 100.0)
     )
     assert share_right(subject_keypoints(capture), subject) == 1
 
 
-def test_a_mirror_image_is_not_taken(tmp_path: Path) -> None:
-    """One camera sees the subject larger in a mirror that stands before it: no other camera sees anybody there."""
+def test_a_mirror_image_is_not_taken_for_the_subject(tmp_path: Path) -> None:
+    """One camera sees the subject larger in a mirror in front of it; no other camera sees anybody there."""
     cameras = ring(4)
     capture, (subject,) = recorded(tmp_path, cameras, walk_m(FRAMES))
     rng = np.random.default_rng(1)
@@ -111,8 +111,8 @@ def test_a_mirror_image_is_not_taken(tmp_path: Path) -> None:
     assert share_right(subject_keypoints(capture), subject) == 1
 
 
-def test_cameras_without_places_choose_each_for_itself(tmp_path: Path) -> None:
-    """All stand at the origin; a stranger, farther from every camera, walks by."""
+def test_cameras_without_poses_choose_the_subject_independently(tmp_path: Path) -> None:
+    """All cameras stand at the origin; in each, a stranger walks by farther away than the subject."""
     cameras = ring(3)
     far = np.stack([walking((-2.5, 2), (-2.5, -2)), walking((2, 2.5), (-2, 2.5)), walking((2, -2.5), (-2, -2.5))])
     capture, (subject, *_) = recorded(tmp_path, cameras, walk_m(FRAMES), *far)
@@ -120,8 +120,8 @@ def test_cameras_without_places_choose_each_for_itself(tmp_path: Path) -> None:
     assert share_right(subject_keypoints(dataclasses.replace(capture, cameras=nowhere)), subject) > 0.9
 
 
-def test_in_a_crowd_the_most_prominent_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    """64 people in either image, of whom the last one is twice as tall as the others."""
+def test_in_a_crowd_only_the_most_prominent_people_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of two images shows 64 people; the last is twice as tall as the others."""
     counts = []
     monkeypatch.setattr(
         people, "_agreements", lambda cameras, found: counts.append([*map(len, found)]) or _AGREED(cameras, found)
@@ -137,30 +137,29 @@ def test_in_a_crowd_the_most_prominent_are_compared(monkeypatch: pytest.MonkeyPa
     assert all(np.array_equal(found, image[:, 63]) for found, image in zip(best.keypoints, images, strict=True))
 
 
-def test_two_who_have_the_same_claim_are_one_line(tmp_path: Path) -> None:
+def test_two_equally_likely_subjects_are_refused(tmp_path: Path) -> None:
     capture, _ = recorded(tmp_path, ring(1), staying((0, -0.6)), staying((0, 0.6)))
     with pytest.raises(InputError, match=r"equal claim.*at \(\d+, \d+\) and \(\d+, \d+\) in camera c0, frame 0; name"):
         subject_keypoints(capture)
 
 
-def test_two_who_have_the_same_claim_are_placed_in_recorded_pixels(tmp_path: Path) -> None:
-    """The recorded picture is 8 times as large: pixel 400 covers its pixels 3200 to 3207, of which 3203.5 is the
-    middle."""
+def test_equally_likely_subjects_are_reported_in_recorded_pixels(tmp_path: Path) -> None:
+    """The recorded image is 8 times as large: pixel 400 covers its pixels 3200 to 3207, whose middle is 3203.5."""
     x, y, seen = np.linspace(-20, 20, 25), np.linspace(-50, 50, 25), np.full(25, CONFIDENCE)
     moving = [np.stack([x + middle, y + 500 + 2 * f, seen], -1) for f in range(FRAMES) for middle in (400, 600)]
     capture = write_capture(tmp_path, ring(1), {"c0": np.reshape(moving, (FRAMES, 2, 25, 3))})
     capture = dataclasses.replace(capture, recorded_sizes_px={"c0": (8000, 8000)})
     with pytest.raises(InputError, match=r"at \(4804, 4004\) and \(3204, 4004\) in camera c0, frame 0"):
         subject_keypoints(capture)
-    # Its lens draws them in, by 1 - r^2 with r = 0.1005 and 0.0995 focal lengths from the middle of the picture.
+    # Its lens scales them by 1 - r^2, with r = 0.1005 and 0.0995 focal lengths from the middle of the image.
     lens = [[8000.0, 0, 3999.5], [0, 8000, 3999.5], [0, 0, 1]], [-1.0, 0, 0, 0]
     with pytest.raises(InputError, match=r"at \(4795, 4003\) and \(3211, 4003\) in camera c0, frame 0"):
         subject_keypoints(dataclasses.replace(capture, recorded_lenses={"c0": lens}))
 
 
 @pytest.mark.parametrize("chosen", [0, 1])
-def test_who_is_named_is_taken(chosen: int, tmp_path: Path) -> None:
-    """By the ground, and by a point in an image."""
+def test_the_named_person_is_the_subject(chosen: int, tmp_path: Path) -> None:
+    """The person may be named by a point on the ground or in an image."""
     cameras = ring(3)
     people_m = staying((0, -0.6)), staying((0, 0.6))
     capture, each = recorded(tmp_path, cameras, *people_m)
@@ -170,8 +169,8 @@ def test_who_is_named_is_taken(chosen: int, tmp_path: Path) -> None:
         assert share_right(subject_keypoints(named), each[chosen]) == 1
 
 
-def test_nobody_at_the_point_is_one_line(tmp_path: Path) -> None:
-    """In frame 5 both are elsewhere; and one camera tells no places on the ground."""
+def test_a_subject_point_where_nobody_is_found_is_refused(tmp_path: Path) -> None:
+    """In frame 5 both people are elsewhere. One camera alone cannot locate people on the ground."""
     people_m = staying((0, -0.6)), staying((0, 0.6))
     for joints_m in people_m:
         joints_m[5] = 100.0
@@ -184,7 +183,7 @@ def test_nobody_at_the_point_is_one_line(tmp_path: Path) -> None:
             subject_keypoints(dataclasses.replace(capture, subject_point=point))
 
 
-def test_one_of_several_cameras_is_one_line(tmp_path: Path) -> None:
+def test_a_person_seen_by_only_one_of_several_cameras_is_refused(tmp_path: Path) -> None:
     cameras = ring(3)
     rng = np.random.default_rng(0)
     seen = {c.name: seen_by(c, walk_m(), rng)[:, None] * (c.name == "c1") for c in cameras}
@@ -192,7 +191,7 @@ def test_one_of_several_cameras_is_one_line(tmp_path: Path) -> None:
         subject_keypoints(write_capture(tmp_path, cameras, seen))
 
 
-def test_a_keypoint_that_is_no_place_is_not_seen(tmp_path: Path) -> None:
+def test_a_nan_keypoint_counts_as_not_seen(tmp_path: Path) -> None:
     capture, (subject,) = recorded(tmp_path, ring(1), walk_m())
     subject["c0"][3, 7, 0] = np.nan
     capture = write_capture(tmp_path, list(capture.cameras.values()), {"c0": subject["c0"][:, None]})
@@ -200,8 +199,8 @@ def test_a_keypoint_that_is_no_place_is_not_seen(tmp_path: Path) -> None:
     assert found[7].tolist() == [0, 0, 0] and np.array_equal(found[8], subject["c0"][3, 8])
 
 
-def test_a_camera_without_keypoints_is_told_how_to_get_them(tmp_path: Path) -> None:
-    """The network is not used by itself, since the other camera's keypoints came with the recording."""
+def test_the_error_for_a_camera_without_keypoints_says_how_to_get_them(tmp_path: Path) -> None:
+    """The network is not run automatically, since the other camera's keypoints came with the recording."""
     capture, _ = recorded(tmp_path, ring(2), walk_m())
     with edited_keypoints(tmp_path) as kept:
         del kept["c1"]

@@ -13,7 +13,7 @@ from tests.capture.test_subject import recorded, share_right, staying, walking
 from tests.study.recording import write_landmarks, write_recording
 
 
-def test_a_subset_has_the_rows_and_files_that_were_chosen(tmp_path: Path) -> None:
+def test_a_subset_has_the_files_of_the_chosen_cameras_and_frames(tmp_path: Path) -> None:
     subset(write_recording(tmp_path / "all"), tmp_path / "few", ("02",), (6, 2), (10,))
     few = Capture.load(tmp_path / "few")
     assert (few.train_cameras, few.test_cameras, tuple(few.cameras)) == (("02",), ("03",), ("02", "03"))
@@ -36,7 +36,7 @@ def test_landmarks_stay_with_their_frames(tmp_path: Path) -> None:
     landmarks = few.landmarks("02")
     assert landmarks is not None
     assert [points[:, 0, 0, 0].tolist() for points in landmarks] == [[2, 6, 10], [0.2, 0.6, 1.0]]
-    assert few.landmarks("03") is None  # no network looked
+    assert few.landmarks("03") is None  # no network looked for any
 
 
 def test_given_poses_stay_with_their_frames(tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_given_poses_stay_with_their_frames(tmp_path: Path) -> None:
     assert few.theta[:, 0, 0].tolist() == few.root[:, 0, 0].tolist() == [2, 6, 10]
 
 
-def test_who_is_named_in_a_camera_left_out_is_named_in_another(tmp_path: Path) -> None:
+def test_a_subject_named_in_a_camera_left_out_is_named_in_another(tmp_path: Path) -> None:
     people_m = staying((0, -0.6)), staying((0, 0.6))
     capture, each = recorded(tmp_path / "all", ring(3), *people_m)
     x, y, _ = each[1]["c1"][7, 0]
@@ -62,8 +62,8 @@ def test_who_is_named_in_a_camera_left_out_is_named_in_another(tmp_path: Path) -
     assert share_right(subject_keypoints(few), {name: each[1][name] for name in ("c0", "c2")}) == 1
 
 
-def test_who_is_named_in_a_frame_left_out_is_named_in_another(tmp_path: Path) -> None:
-    """They have changed places by then: the other one is nearest to the point."""
+def test_a_subject_named_in_a_frame_left_out_is_named_in_another(tmp_path: Path) -> None:
+    """In the frames that are left, two people have changed places: the other one is nearest to the point."""
     people_m = walking((-1.2, -0.3), (1.2, -0.3)), walking((1.2, 0.3), (-1.2, 0.3))
     capture, each = recorded(tmp_path / "all", ring(3), *people_m)
     x, y, _ = each[0]["c1"][0, 0]
@@ -83,7 +83,7 @@ def test_none_keeps_everything(tmp_path: Path) -> None:
     assert (tmp_path / "same" / "capture.json").read_text() == (capture.root / "capture.json").read_text()
 
 
-def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_a_missing_camera_or_frame_is_refused(tmp_path: Path) -> None:
     capture = write_recording(tmp_path / "all")
     with pytest.raises(InputError, match="ada: no training camera 03; there are 01, 02"):
         subset(capture, tmp_path / "a", ("03",), None, None)

@@ -21,21 +21,21 @@ def test_nearest_frame_by_hand() -> None:
 def test_keypoints_between_frames_by_hand() -> None:
     moving = np.stack([people_at(10 * frame) for frame in range(4)])
     found = resample(moving, range(4), np.array([1.25, 2.0, 3.4, 3.6, -0.6]))
-    # Between frames linearly; beyond the ends as at the ends for half a step, then nobody.
+    # Linear between frames; beyond the ends, the last value for half a step, then nobody.
     np.testing.assert_allclose(found[:3, 0, 0], [[12.5, 0, 0.8], [20, 0, 0.8], [30, 0, 0.8]])
     assert not found[3:].any()
     strided = resample(moving, (0, 5, 10, 15), np.array([2.0, 17.0, 18.0]))
     assert strided[:, 0, 0].tolist() == [[4, 0, 0.8], [30, 0, 0.8], [0, 0, 0]]
 
 
-def test_keypoints_do_not_cross_a_gap() -> None:
+def test_keypoints_are_not_interpolated_across_a_gap() -> None:
     frames = (0, 1, 2, 10, 11)
     moving = np.stack([people_at(10 * frame) for frame in frames])
     found = resample(moving, frames, np.array([2.3, 6.0, 9.6, 10.5]))
     assert found[:, 0, 0, 0].tolist() == [20, 0, 100, 105]
 
 
-def test_a_keypoint_of_one_frame_is_taken_from_there() -> None:
+def test_a_keypoint_seen_in_one_frame_only_is_taken_from_it() -> None:
     pair = np.stack([people_at(0), people_at(10)])
     pair[1, 0, 1] = 0
     found = resample(pair, (0, 1), np.array([0.25, 0.75]))
@@ -43,20 +43,20 @@ def test_a_keypoint_of_one_frame_is_taken_from_there() -> None:
     assert found[1, 0].tolist() == [[7.5, 0, 0.8], [0, 0, 0]]
 
 
-def test_people_are_followed_whatever_their_order() -> None:
+def test_people_are_matched_between_frames_in_any_order() -> None:
     swapped = np.stack([people_at(0, 500), people_at(510, 10)])
     assert resample(swapped, (0, 1), np.array([0.4]))[0, :, 0, 0].tolist() == [4, 504]
 
 
 def test_hands_keep_their_order_however_far_they_move() -> None:
-    """Crossed hands, a point of which the second frame does not show."""
+    """Hands cross; the second frame lacks one of their points."""
     crossing = np.stack([people_at(0, 100), people_at(100, 0)])
     crossing[1, 1, 1] = 0
     found = resample(crossing, (0, 1), np.array([0.25]), in_order=True)
     assert found[0].tolist() == [[[25, 0, 0.8], [25, 100, 0.8]], [[75, 0, 0.8], [100, 100, 0.8]]]
 
 
-def test_a_capture_in_step_reads_the_nearest_frame(tmp_path: Path) -> None:
+def test_a_synchronised_capture_reads_the_nearest_frames(tmp_path: Path) -> None:
     camera = Camera("a", np.eye(3), np.eye(3), np.zeros(3), 4, 4)
     for frame in range(6):
         for folder, value in (("images", 40 * frame), ("masks", 255 * (frame == 4))):
@@ -74,7 +74,7 @@ def test_a_capture_in_step_reads_the_nearest_frame(tmp_path: Path) -> None:
     assert found is not None
     np.testing.assert_allclose(found[:, 0, 0, 0], [17.5, 27.5, 37.5, 47.5])
 
-    hands = in_step.hands("a")  # the right one passes the left in strides of nearly its own length
+    hands = in_step.hands("a")  # the right hand moves by nearly its own length per frame
     assert hands is not None
     np.testing.assert_allclose(hands[:, :, 0, 0], [[0, x] for x in (157.5, 247.5, 337.5, 427.5)])
 

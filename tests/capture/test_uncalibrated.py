@@ -36,7 +36,7 @@ def write_images(folder: Path, camera: str, exif: Image.Exif | None = None) -> N
         (None, None, 170, ""),  # a guess
     ],
 )
-def test_an_angle_given_or_metadata_or_a_guess_makes_the_lens(
+def test_the_lens_comes_from_a_given_angle_metadata_or_a_guess(
     fov_deg: float | None, focal_mm: int | None, focal_px: float, source: str, tmp_path: Path
 ) -> None:
     exif = Image.Exif()
@@ -61,12 +61,12 @@ def test_a_videos_metadata_give_the_focal_length(tmp_path: Path) -> None:
     assert focal_35mm(video) == 28
     video.write_bytes(whole[:-1])
     assert focal_35mm(video) is None
-    start = whole.index(b"moov") - 4  # the last box may leave its size out, however much comes before
+    start = whole.index(b"moov") - 4  # the last box may omit its size, however much comes before
     video.write_bytes(box(b"free", bytes(MAX_METADATA_BYTES)) + whole[:start] + bytes(4) + whole[start + 4 :])
     assert focal_35mm(video) == 28
 
 
-def test_a_tracks_metadata_give_the_focal_length_where_the_movies_do_not(tmp_path: Path) -> None:
+def test_a_tracks_metadata_give_the_focal_length_if_the_movies_do_not(tmp_path: Path) -> None:
     tracks = box(b"trak", box(b"tkhd", b"")) + box(b"trak", box(b"tkhd", b"") + apple_metadata(24))
     video = tmp_path / "a.mov"
     for movie, expected in ((b"", 24), (box(b"meta", b""), 24), (apple_metadata(28), 28)):
@@ -75,7 +75,7 @@ def test_a_tracks_metadata_give_the_focal_length_where_the_movies_do_not(tmp_pat
 
 
 @pytest.mark.parametrize("name", ["intri.yml", "lenses.toml"])
-def test_a_lens_file_comes_first(tmp_path: Path, name: str) -> None:
+def test_a_lens_file_takes_precedence(tmp_path: Path, name: str) -> None:
     for camera in "ab":
         write_images(tmp_path, camera)
     matrix = "K_a: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [150, 0, 99, 0, 150, 49, 0, 0, 1]\n"
@@ -88,7 +88,7 @@ def test_a_lens_file_comes_first(tmp_path: Path, name: str) -> None:
     assert known["a"].lens.t_m.tolist() == [0, 0, 0] and known["b"].source == "90 degrees given"
 
 
-def test_a_lens_that_a_calibration_estimated_is_not_given_unless_it_is_named(tmp_path: Path) -> None:
+def test_lenses_that_a_calibration_estimated_are_used_only_if_their_file_is_named(tmp_path: Path) -> None:
     for camera in "ab":
         write_images(tmp_path, camera)
     K, here = np.array([[150.0, 0, 99], [0, 150, 49], [0, 0, 1]]), (np.zeros(4), np.eye(3), np.zeros(3), (200, 100))
@@ -128,7 +128,7 @@ def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> No
     assert capture.cameras["left"].K[0, 0] == pytest.approx(0.85 * 96)
 
 
-def test_photos_beside_videos_do_not_hide_them(tmp_path: Path) -> None:
+def test_photos_next_to_videos_do_not_hide_them(tmp_path: Path) -> None:
     for name in ("left", "right"):
         write_video(tmp_path / f"{name}.mp4", 3)
     (tmp_path / "images").mkdir()
@@ -150,14 +150,14 @@ def test_each_video_is_decoded_once_to_count_its_frames(tmp_path: Path, monkeypa
     assert sorted(opened) == ["left.mp4", "right.mp4"]
 
 
-def test_images_come_before_a_video_of_the_same_name(tmp_path: Path) -> None:
+def test_images_take_precedence_over_a_video_of_the_same_name(tmp_path: Path) -> None:
     write_images(tmp_path, "left")
     write_video(tmp_path / "left.mp4", 3)
     assert Uncalibrated(tmp_path).footage("left").frames == (0, 1)  # the video has three
 
 
 @pytest.mark.parametrize("place", ["", "videos"])
-def test_two_videos_of_one_name_are_refused_and_sound_is_none(tmp_path: Path, place: str) -> None:
+def test_two_videos_of_one_name_are_refused_but_a_sound_file_is_not_a_video(tmp_path: Path, place: str) -> None:
     write_video(tmp_path / place / "ada.mp4", 3)
     (tmp_path / place / "ada.wav").touch()
     assert cameras_without_calibration(tmp_path) == ["ada"]
@@ -166,9 +166,9 @@ def test_two_videos_of_one_name_are_refused_and_sound_is_none(tmp_path: Path, pl
         cameras_without_calibration(tmp_path)
 
 
-def test_a_run_names_the_command_that_calibrates(tmp_path: Path) -> None:
+def test_an_uncalibrated_recording_is_refused_with_the_command_to_calibrate_it(tmp_path: Path) -> None:
     write_images(tmp_path, "a")
-    with pytest.raises(InputError, match=r"images/a: one camera .* make a video"):  # which cannot be calibrated
+    with pytest.raises(InputError, match=r"images/a: one camera .* make a video"):  # one camera cannot be calibrated
         recognise(tmp_path)
     write_images(tmp_path, "b")
     with pytest.raises(InputError, match=r"no calibration.*hnerf calibrate .* --from person"):
@@ -185,7 +185,7 @@ def test_a_run_names_the_command_that_calibrates(tmp_path: Path) -> None:
         ("[frames]\ntrain = [0, 1, 2, 3, 4]", "02", None),
     ],
 )
-def test_what_other_cameras_and_places_are_needed_for_is_not_asked(
+def test_settings_that_need_other_cameras_or_the_ground_are_ignored(
     tmp_path: Path, toml: str, only: str | None, point: SubjectPoint | None
 ) -> None:
     """Camera 02, read alone, is a frame shorter than `capture.toml` says; the ground is not known yet."""
@@ -199,7 +199,7 @@ def test_what_other_cameras_and_places_are_needed_for_is_not_asked(
 
 
 def test_board_footage_is_not_read_without_calibration(tmp_path: Path) -> None:
-    """It shows one of the cameras only, and would be searched once for each."""
+    """Cameras are read one by one, and the board would be searched for again each time."""
     folder = write_easymocap(tmp_path / "ada")
     write_image(folder / "calibration" / "extrinsic" / "01" / "0.png", np.zeros((16, 24, 3), np.uint8))
     (folder / "capture.toml").write_text("[board]\ncolumns = 4\nrows = 5\nsquare_m = 0.05\n")

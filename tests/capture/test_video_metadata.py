@@ -15,7 +15,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_what_cannot_be_read_states_nothing(case: str, tmp_path: Path) -> None:
+def test_unreadable_metadata_give_no_focal_length(case: str, tmp_path: Path) -> None:
     name, content = HOSTILE[case]
     (tmp_path / name).write_bytes(content)
     assert focal_35mm(tmp_path / name) is None

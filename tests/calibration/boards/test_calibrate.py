@@ -54,7 +54,7 @@ def board_at(time: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen(cameras: list[Camera], lags: dict[str, float], frames: Sequence[int] = range(FRAMES)) -> np.ndarray:
-    """Return corners (C, F, N, 2) with noise; a camera with a lag takes every image that much later."""
+    """Return corners (C, F, N, 2) with noise. lags: by how many frames a camera takes each image later."""
     corners_px = np.zeros((len(cameras), len(frames), len(BOARD.corners_m), 2))
     for i, camera in enumerate(cameras):
         for row, frame in enumerate(frames):
@@ -82,8 +82,8 @@ def test_cameras_and_their_lag_are_found() -> None:
     corners_px[0, 5, 3] += 30.0  # one corner mistaken for another
     fit = solve_rig(cameras, BOARD.corners_m, planar_corners(BOARD.corners_m, corners_px))
     for figures in compare_pairs(cameras, fit.cameras).values():
-        assert figures["turned_deg"] < 0.3 and figures["moved_cm"] < 0.8  # 4 degrees and 8 cm if b's lag is denied
-    # Only differences between cameras can be known: a and c were in step, b later.
+        assert figures["turned_deg"] < 0.3 and figures["moved_cm"] < 0.8  # 4 degrees and 8 cm if b's lag is ignored
+    # Only differences between cameras can be known: a and c were synchronised, b was later.
     lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
     assert lag == pytest.approx(LAG, abs=0.05)
     assert np.isnan(fit.residuals_px[0, 5, 3]).all() and np.isfinite(fit.residuals_px[0, 5, 4]).all()
@@ -91,8 +91,8 @@ def test_cameras_and_their_lag_are_found() -> None:
     assert np.sqrt((fit.error_px() ** 2).mean()) == pytest.approx(NOISE_PX * np.sqrt(2), abs=0.03)
 
 
-def test_offsets_count_frames_of_the_footage() -> None:
-    """With every second frame, a lag of 0.4 of the distance between images is 0.8 frames."""
+def test_offsets_are_in_frames_of_the_footage() -> None:
+    """If only every second frame is used, a lag of 0.4 of the interval between images is 0.8 frames."""
     cameras = rig()
     fit = solve_rig(cameras, BOARD.corners_m, planar_corners(BOARD.corners_m, seen(cameras, {"b": LAG})), frame_step=2)
     lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
@@ -100,8 +100,8 @@ def test_offsets_count_frames_of_the_footage() -> None:
     assert max(figures["turned_deg"] for figures in compare_pairs(cameras, fit.cameras).values()) < 0.3
 
 
-def test_frames_with_a_gap_between_them_are_no_neighbours() -> None:
-    """The board's path does not lead from one burst of images straight to the next: 2 degrees and 5 cm otherwise."""
+def test_frames_across_a_gap_are_not_neighbours() -> None:
+    """The board does not move straight from one burst of images to the next; assuming so costs 2 degrees and 5 cm."""
     cameras, frames = rig(), [first + i for first in (0, 20, 40, 60) for i in range(4)]
     corners_px = planar_corners(BOARD.corners_m, seen(cameras, {"b": LAG}, frames))
     fit = solve_rig(cameras, BOARD.corners_m, corners_px, frames=frames)
@@ -110,7 +110,7 @@ def test_frames_with_a_gap_between_them_are_no_neighbours() -> None:
     assert np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0]) == pytest.approx(LAG, abs=0.1)
 
 
-def test_a_corner_off_its_plane_and_a_picture_of_few_are_dropped() -> None:
+def test_off_plane_corners_and_images_with_few_corners_are_dropped() -> None:
     corners_px = seen(rig(), {})[:1, :2]
     corners_px[0, 0, 7] += [3.0, 0]
     corners_px[0, 1, 5:] = np.nan  # five are left
@@ -126,12 +126,12 @@ def test_a_pose_needs_six_corners_in_two_rows() -> None:
 
 def test_unlinked_cameras_are_refused() -> None:
     corners_px = seen(rig(), {})
-    corners_px[2, 2:] = np.nan  # c shares two frames
+    corners_px[2, 2:] = np.nan  # c shares only two frames
     with pytest.raises(InputError, match="camera c: shares fewer than 3 frames"):
         solve_rig(rig(), BOARD.corners_m, corners_px)
 
 
-def test_board_evidence_names_cameras_it_knows_nothing_about(tmp_path: Path) -> None:
+def test_board_evidence_lists_unlinked_cameras(tmp_path: Path) -> None:
     corners_px = seen(rig(), {})
     corners_px[2] = np.nan
     capture = write_capture(tmp_path, rig(), {camera.name: np.zeros((2, 1, 25, 3)) for camera in rig()})
@@ -153,15 +153,15 @@ def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
     found = board_evidence(capture)
     assert found is not None
     rms_px = {name: camera["rms_px"] for name, camera in found["cameras"].items()}
-    # One degree at a focal length of 1000 px is 17.5 px; the other two agree and hold the board.
+    # One degree at a focal length of 1000 px is 17.5 px; the other two agree and determine the board's pose.
     assert 10 < rms_px["b"] < 20 and max(rms_px["a"], rms_px["c"]) < 5
     assert max(camera["footage_rms_px"] for camera in found["cameras"].values()) < 0.2
     assert found["pairs"]["a-b"]["turned_deg"] == pytest.approx(1.0, abs=0.1)
     assert found["pairs"]["a-c"]["turned_deg"] < 0.1
 
 
-def test_board_evidence_knows_where_frames_are_missing(tmp_path: Path) -> None:
-    """In bursts of images, of which b takes each LAG later, the cameras still agree with themselves."""
+def test_board_evidence_allows_for_gaps_between_frames(tmp_path: Path) -> None:
+    """In bursts of images that b takes LAG later, each camera still fits its own footage."""
     cameras, frames = rig(), tuple(first + i for first in (0, 20, 40, 60) for i in range(4))
     capture = write_capture(tmp_path, cameras, {camera.name: np.zeros((2, 1, 25, 3)) for camera in cameras})
     BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {"b": LAG}, frames), 1, frames).save(capture.root)
@@ -171,7 +171,7 @@ def test_board_evidence_knows_where_frames_are_missing(tmp_path: Path) -> None:
     assert max(pair["turned_deg"] for pair in found["pairs"].values()) < 1
 
 
-def test_visible_means_facing_inside_and_found_by_another() -> None:
+def test_a_visible_board_faces_the_camera_is_inside_the_image_and_found_by_another_camera() -> None:
     """The board shows its back in frame 1, only c finds it in frame 2, and it is far above every image in frame 3."""
     cameras = rig()
     R, t_m = board_at(0)
@@ -186,8 +186,8 @@ def test_visible_means_facing_inside_and_found_by_another() -> None:
 
 
 def close_up(tilt: float) -> np.ndarray:
-    """Return corners (20, N, 2) seen by a lens of 900 px and k1 = -0.2, the board turned by up to `tilt` about each
-    axis."""
+    """Return corners (20, N, 2) seen through a lens of 900 px and k1 = -0.2. tilt: up to how many radians the board is
+    turned about each axis."""
     K, distortion = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0])
     rng = np.random.default_rng(1)
     poses = [(rng.uniform(-tilt, tilt, 3), rng.uniform([-0.3, -0.2, 0.6], [0.1, 0.05, 0.6])) for _ in range(20)]
@@ -195,7 +195,7 @@ def close_up(tilt: float) -> np.ndarray:
     return np.stack(views) + NOISE_PX * rng.normal(size=(20, 20, 2))
 
 
-def test_a_lens_is_believed_only_if_the_pictures_fix_it() -> None:
+def test_a_lens_is_reliable_only_if_the_images_determine_it() -> None:
     """Boards that all face the camera say nothing about the focal length, and nine images are too few."""
     tilted, facing, few = (
         estimate_lens("a", BOARD.corners_m, corners_px, (1280, 720))
@@ -229,7 +229,7 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
     assert calibrate_from_boards(tmp_path).intrinsics["a"].startswith("from intrinsic/: 20 pictures")
 
 
-def test_given_intrinsics_without_a_size_have_that_of_the_footage(
+def test_given_intrinsics_without_a_size_take_the_size_of_the_footage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = Lens("a", np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0]), np.eye(3),
@@ -242,8 +242,8 @@ def test_given_intrinsics_without_a_size_have_that_of_the_footage(
 
 
 @pytest.mark.parametrize("kind", ["easymocap", "caliscope"])
-def test_intrinsics_need_no_poses_beside_them(tmp_path: Path, kind: str) -> None:
-    """There is board footage, too, in the folder calibration/ that Pose2Sim has."""
+def test_intrinsics_are_read_from_files_without_poses(tmp_path: Path, kind: str) -> None:
+    """The folder also has calibration/ with board footage, like the Pose2Sim layout."""
     (tmp_path / "calibration" / "extrinsic").mkdir(parents=True)
     given = Lens("cam_7", np.diag([900.0, 900, 1]), np.zeros(5), np.eye(3), np.zeros(3), (1000, 1000))
     write_cameras(tmp_path, [given], kind)
@@ -259,13 +259,13 @@ def test_intrinsics_need_no_poses_beside_them(tmp_path: Path, kind: str) -> None
     assert lenses["cam_7"].K[0, 0] == 900 and words["cam_7"].startswith("given; not verified")
 
 
-def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_board_in_the_ground_frame_defines_the_floor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the last frame the board lies flat under cameras that look down on it, so z must be their height."""
     cameras = rig()
     corners_px = seen(cameras, {})
     flat = np.diag([1.0, -1, -1]), np.array([-0.1, 0.1, 0.8])  # z down, at the height of 0.8 m
     for i, camera in enumerate(cameras):
-        corners_px[i, -2] = np.nan  # it was put down out of sight
+        corners_px[i, -2] = np.nan  # while it is put down, nobody sees it
         corners_px[i, -1] = camera.project(BOARD.corners_m @ flat[0].T + flat[1])[0]
     intrinsics = {c.name: Lens(c.name, c.K, np.zeros(4), np.eye(3), np.zeros(3), (1000, 1000)) for c in cameras}
     frames = tuple(range(100, 100 + FRAMES))
@@ -296,7 +296,9 @@ def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pyt
     assert layout.lenses()["b"].t_m == pytest.approx(calibration.lenses["b"].t_m)
 
 
-def test_a_board_that_is_found_nowhere_is_hardly_that_board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_board_found_in_few_images_is_refused_as_the_wrong_board(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = dict.fromkeys("ab", np.full((9, len(BOARD.corners_m), 2), np.nan))
     found["a"] = seen(rig(), {})[0, :9].copy()
     found["a"][2:] = np.nan

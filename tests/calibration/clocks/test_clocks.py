@@ -1,4 +1,4 @@
-"""Clocks of cameras from keypoints and from sound, against known ones."""
+"""Camera clocks estimated from keypoints and from sound, compared with known clocks."""
 
 import tracemalloc
 import wave
@@ -18,7 +18,7 @@ FPS = 30.0
 
 
 def wandering_m(instants_s: np.ndarray) -> np.ndarray:
-    """Return joints (n, 25, 3) of a figure that wanders, turns and reaches, never twice in the same way."""
+    """Return joints (n, 25, 3) of a figure that wanders, turns and reaches without repeating itself."""
     waves = np.random.default_rng(3).uniform((0.05, 0), (0.6, 2 * np.pi), (12, 2))
 
     def slow(k: int) -> np.ndarray:
@@ -37,7 +37,7 @@ def wandering_m(instants_s: np.ndarray) -> np.ndarray:
 
 
 def filmed(index: int, seconds: float, offset_s: float, drift: float = 0.0, fps: float = FPS) -> Track:
-    """Return what camera `index` of a ring sees; its clock shows (1 + drift) t + offset_s."""
+    """Return the track that camera `index` of a ring sees; its clock shows (1 + drift) t + offset_s."""
     own_s = np.arange(int(seconds * fps)) / fps
     camera = ring(4)[index]
     uv = camera.project(wandering_m((own_s - offset_s) / (1 + drift)))[0]
@@ -45,7 +45,7 @@ def filmed(index: int, seconds: float, offset_s: float, drift: float = 0.0, fps:
     return Track(own_s, np.concatenate([uv, np.full_like(uv[..., :1], 0.8)], -1))
 
 
-def test_offsets_of_any_size_and_fractions_of_a_frame_at_other_rates() -> None:
+def test_offsets_of_many_frames_or_a_fraction_are_found_at_different_frame_rates() -> None:
     true_s = {"c0": 0.0, "c1": 37 / FPS, "c2": -11.37 / FPS, "c3": 20.6 / FPS}
     tracks = {
         name: filmed(i, 4.0, offset, fps=25.0 if i == 3 else FPS) for i, (name, offset) in enumerate(true_s.items())
@@ -56,7 +56,7 @@ def test_offsets_of_any_size_and_fractions_of_a_frame_at_other_rates() -> None:
         assert found.clocks[name].rate == 1.0
 
 
-def test_clocks_of_pairs_in_a_chain_by_hand() -> None:
+def test_solving_a_chain_of_pairwise_clocks_by_hand() -> None:
     """b = a + 1 +- 0.1 and c = 1.5 b + 2 +- 0.2: 3.5, and an error of sqrt((1.5 x 0.1)^2 + 0.2^2) = 0.25."""
     pairs = [("a", "b"), ("b", "c")]
     differences, errors = dict(zip(pairs, (1.0, 2.0), strict=True)), dict(zip(pairs, (0.1, 0.2), strict=True))
@@ -65,16 +65,16 @@ def test_clocks_of_pairs_in_a_chain_by_hand() -> None:
     np.testing.assert_allclose(error, [0, 0.1, 0.25])
 
 
-def test_a_pair_that_contradicts_two_others_hardly_counts() -> None:
-    """d is 3 after a by way of b and of c, and 4 directly, a hundred standard errors off."""
+def test_a_pair_that_contradicts_the_others_gets_little_weight() -> None:
+    """d is 3 later than a by way of b or c, but 4 later directly, which is a hundred standard errors off."""
     differences = {("a", "b"): 1.0, ("a", "c"): 2.0, ("a", "d"): 4.0, ("b", "c"): 1.0, ("b", "d"): 2.0, ("c", "d"): 1.0}
     x, _ = _solve(list("abcd"), differences, dict.fromkeys(differences, 0.01), {})
     np.testing.assert_allclose(x, [0, 1, 2, 3], atol=0.01)
 
 
-def test_a_drift_that_two_cameras_show_outlasts_a_third_that_tells_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """b drifts by 400 +- 10 ppm against a; c recorded too briefly, and tells 0 +- 100 ppm of both. Then c is halfway,
-    and (b - 400)^2 / 10^2 + 2 (b / 2)^2 / 100^2 is least at b = 400 / 1.005."""
+def test_a_precise_drift_outweighs_pairs_too_short_to_measure_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """b drifts by 400 +- 10 ppm against a. c recorded too briefly: 0 +- 100 ppm against both. Least squares put c
+    halfway, and (b - 400)^2 / 10^2 + 2 (b / 2)^2 / 100^2 is least at b = 400 / 1.005."""
     short = pair_clock(smoothed(filmed(0, 5, 0.0)), smoothed(filmed(2, 5, 0.5)))
     assert (short.rate, short.rate_error) == (1.0, pytest.approx(1e-4))
     drifting = short._replace(offset_s=0.0, rate=1 + 4e-4, rate_error=1e-5)
@@ -87,11 +87,11 @@ def test_a_drift_that_two_cameras_show_outlasts_a_third_that_tells_none(monkeypa
     assert 1e6 * (found.clocks["c"].rate - 1) == pytest.approx(199, abs=1)
 
 
-def test_a_short_recording_is_in_step_where_it_was_made_though_the_rate_of_its_clock_is_a_guess(
+def test_a_short_recording_with_a_guessed_clock_rate_is_synchronised_while_it_lasts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """b drifts by 100 ppm against a; c recorded 20 s of both, around 570 s by a's clock, when b's showed 570.057 s and
-    its own 10 s. Whatever rate c is given, it must show 10 s at 570 s."""
+    """b drifts by 100 ppm against a. c recorded for only 20 s, around 570 s by a's clock, when b's clock showed
+    570.057 s and its own 10 s. Whatever rate c is given, it must show 10 s at 570 s."""
     pairs = {
         "ab": PairClock(0.0, 1 + 1e-4, 300.0, 5e-4, 2e-6, 0.2),
         "ac": PairClock(-560.0, 1.0, 570.0, 1e-3, 1e-4, 0.2),
@@ -111,7 +111,7 @@ def test_a_drift_of_200_ppm_in_five_minutes() -> None:
     assert found.offset_s == pytest.approx(12.34, abs=0.1 / FPS)
 
 
-def test_known_cameras_tell_steps_of_an_even_walk_apart() -> None:
+def test_known_cameras_tell_apart_the_steps_of_an_even_walk() -> None:
     def walk(index: int, offset_s: float) -> Track:
         own_s = np.arange(120) / FPS
         angle = 1.5 * (own_s - offset_s)
@@ -125,12 +125,12 @@ def test_known_cameras_tell_steps_of_an_even_walk_apart() -> None:
 
     a, b = smoothed(walk(0, 0.0)), smoothed(walk(1, 0.41))
     with pytest.raises(InputError, match="walks evenly on"):
-        pair_clock(a, b)  # later by a step, seen from a camera further around: the same pictures
+        pair_clock(a, b)  # one step later, from a camera further around, looks the same
     found = pair_clock(a, b, fundamental(*ring(4)[:2]))
     assert found.offset_s == pytest.approx(0.41, abs=0.1 / FPS)
 
 
-def test_smoothing_is_a_parabola_by_hand() -> None:
+def test_smoothing_reproduces_a_parabola_by_hand() -> None:
     times_s = np.arange(9) / 10
     keypoints = np.ones((9, 25, 3))
     keypoints[..., 0] = (10 + 3 * times_s + 2 * times_s**2)[:, None]
@@ -142,23 +142,23 @@ def test_smoothing_is_a_parabola_by_hand() -> None:
     assert velocity[0, 0, 0] / path.to_unit[0, 0] == pytest.approx(3 + 4 * 0.42)
 
 
-def test_detections_that_are_smoothed_together_count_as_one() -> None:
-    """A tenth of a second on each side: 7 frames at 30 a second, 25 at 120, and at 10 two on each side, 5 frames, whose
-    half second is 15 frames at 30. Of 600 frames every second one is used, then every tenth."""
+def test_detections_smoothed_together_count_as_one() -> None:
+    """Smoothing takes a tenth of a second on each side: 7 frames at 30 a second, 25 at 120. At 10 it takes two on each
+    side; these 5 frames last as long as 15 at 30 a second. Then, of 600 frames, every second or tenth is used."""
     at_30, at_120, at_10 = (smoothed(filmed(0, 20.0, 0.0, fps=fps)) for fps in (30.0, 120.0, 10.0))
     pairs = (at_30, at_30, 600), (at_120, at_120, 2400), (at_30, at_10, 600), (at_30, at_30, 300), (at_30, at_30, 60)
     assert [_off_together(*pair) for pair in pairs] == pytest.approx([7, 25, 15, 3.5, 1])
 
 
-def test_a_clock_is_the_less_sure_the_more_detections_are_smoothed_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four times the 7 that are: twice the error."""
+def test_the_clock_error_grows_with_the_number_of_detections_smoothed_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With 28 detections instead of 7, four times as many, the error doubles."""
     a, b = smoothed(filmed(0, 6.0, 0.0)), smoothed(filmed(1, 6.0, 0.4))
     error_s = pair_clock(a, b).error_s
     monkeypatch.setattr("hnerf.calibration.clocks.keypoints._off_together", lambda *_: 28.0)
     assert pair_clock(a, b).error_s == pytest.approx(2 * error_s)
 
 
-def test_one_camera_and_a_person_who_is_still_are_refused() -> None:
+def test_one_camera_or_a_person_who_does_not_move_is_refused() -> None:
     with pytest.raises(InputError, match="nothing to be synchronised with"):
         estimate_clocks({"c0": filmed(0, 4.0, 0.0)})
     still = {f"c{i}": Track(np.arange(90) / FPS, np.repeat(filmed(i, 3, 0.0).keypoints[:1], 90, 0)) for i in (0, 1)}
@@ -173,15 +173,15 @@ def test_a_camera_that_never_shows_the_person_is_named() -> None:
         estimate_clocks({"c0": seen, "c1": unseen})
 
 
-def test_recordings_that_their_sound_puts_apart_are_not_said_to_show_too_little_motion() -> None:
+def test_recordings_that_do_not_overlap_by_their_sound_are_refused_for_that_reason() -> None:
     a, b = smoothed(filmed(0, 2.0, 0.0)), smoothed(filmed(1, 2.0, 0.4))
     with pytest.raises(InputError, match=r"\+5\.0 s apart, as their sound has them, share fewer than 100 keypoints"):
         pair_clock(a, b, near_s=5.0)
 
 
 def heard(rng: np.random.Generator, dry: np.ndarray, delay: int) -> np.ndarray:
-    """Return a dry sound after `delay` samples, with noise and 30 echoes of its own corner of a room, which together
-    are as loud as itself and die down by 60 dB in 0.4 s."""
+    """Return a dry sound delayed by `delay` samples, with noise and 30 random echoes of a room, which together are as
+    loud as the sound and decay by 60 dB in 0.4 s."""
     response = np.zeros(4000)
     response[0] = 1
     echoes = rng.integers(50, 4000, 30)
@@ -192,7 +192,7 @@ def heard(rng: np.random.Generator, dry: np.ndarray, delay: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["claps", "speech"])
-def test_sound_with_echoes_within_two_milliseconds(kind: str) -> None:
+def test_the_offset_of_echoing_sound_is_found_within_two_milliseconds(kind: str) -> None:
     rng = np.random.default_rng(0)
     dry = rng.normal(size=16_000 * 6)
     if kind == "claps":
@@ -205,7 +205,7 @@ def test_sound_with_echoes_within_two_milliseconds(kind: str) -> None:
     assert sound_offset(b, a) == pytest.approx(-19_733 / 16_000, abs=0.002)
 
 
-def test_hours_of_sound_fit_into_memory() -> None:
+def test_long_recordings_of_sound_fit_into_memory() -> None:
     """In single precision, and with few copies: two recordings of 40 minutes need 3 GB."""
     rng = np.random.default_rng(2)
     a = rng.normal(size=520_000).astype(np.float32)
@@ -218,12 +218,12 @@ def test_hours_of_sound_fit_into_memory() -> None:
         tracemalloc.stop()
 
 
-def test_unrelated_sound_tells_nothing() -> None:
+def test_unrelated_sound_gives_no_offset() -> None:
     rng = np.random.default_rng(1)
     assert sound_offset(rng.normal(size=50_000), rng.normal(size=60_000)) is None
 
 
-def test_silence_and_a_click_tell_nothing(tmp_path: Path) -> None:
+def test_silence_and_a_click_give_no_offset(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).normal(size=50_000)
     assert sound_offset(noise, np.zeros(50_000)) is None and sound_offset(np.zeros(50_000), np.zeros(50_000)) is None
     assert sound_offset(noise, noise[:300]) is None and sound_offset(noise[:300], noise[:300]) is None
@@ -234,7 +234,7 @@ def test_silence_and_a_click_tell_nothing(tmp_path: Path) -> None:
     assert sound is not None and len(sound) == 1
 
 
-def test_a_wave_file_beside_a_video_is_read_at_any_rate(tmp_path: Path) -> None:
+def test_a_wave_file_next_to_a_video_is_read_at_any_sample_rate(tmp_path: Path) -> None:
     tone = (1000 * np.sin(2 * np.pi * 440 * np.arange(48_000) / 48_000)).astype("<i2")
     with wave.open(str(tmp_path / "a.wav"), "wb") as file:
         file.setnchannels(2), file.setsampwidth(2), file.setframerate(48_000)
@@ -251,8 +251,8 @@ def test_a_wave_file_beside_a_video_is_read_at_any_rate(tmp_path: Path) -> None:
         read_sound(tmp_path / "a.mp4")
 
 
-def test_a_wave_file_of_parts_that_do_not_fit_or_a_link_is_refused(tmp_path: Path) -> None:
-    """Bytes 16 to 19 are the size of the description of the format."""
+def test_a_malformed_or_linked_wave_file_is_refused(tmp_path: Path) -> None:
+    """Bytes 16 to 19 are the size of the format chunk."""
     with wave.open(str(tmp_path / "a.wav"), "wb") as file:
         file.setparams((1, 2, 16_000, 0, "NONE", "none"))
         file.writeframes(bytes(20))

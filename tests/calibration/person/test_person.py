@@ -1,4 +1,4 @@
-"""Cameras from the person: rigs, lenses, up and scale against known cameras, and refusals."""
+"""Cameras calibrated from the person: rig, lenses, vertical and scale compared with known cameras, and refusals."""
 
 import dataclasses
 from itertools import pairwise
@@ -23,10 +23,10 @@ from tests.calibration.synthetic import STANDING_M, detections, look_at, ring, t
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
-STATURE_M = 1.56 / 0.87  # of the figure: its limb chain, over the chain's share of an adult's stature
+STATURE_M = 1.56 / 0.87  # of the figure: its limb chain, divided by the chain's share of an adult's stature
 
 
-def lost(camera: Camera) -> Camera:
+def without_pose(camera: Camera) -> Camera:
     """Return the camera without its pose."""
     return dataclasses.replace(camera, R=np.eye(3), t_m=np.zeros(3))
 
@@ -45,45 +45,45 @@ def seen_by(cameras: list[Camera], noise_px: float) -> np.ndarray:
 
 def test_a_rig_is_found_without_poses() -> None:
     truth = ring(4)
-    found = first_poses([lost(camera) for camera in truth], seen_by(truth, 0.5))
+    found = first_poses([without_pose(camera) for camera in truth], seen_by(truth, 0.5))
     turn_deg, move_m = worst_errors(found, truth)
     assert turn_deg < 0.1 and move_m < 0.01
 
 
-def test_a_pair_in_a_wrong_pose_does_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most keypoints seem to fit it, but no other camera fits the points that the two triangulate."""
+def test_a_pair_with_a_wrong_pose_does_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most keypoints seem to fit the pair, but no other camera fits the points that it triangulates."""
     truth, found = ring(4), rig._relative_pose
 
-    def misled(a: Camera, b: Camera, keypoints: np.ndarray, inlier_px: float) -> rig._Pair | None:
+    def misleading(a: Camera, b: Camera, keypoints: np.ndarray, inlier_px: float) -> rig._Pair | None:
         pair = found(a, b, keypoints, inlier_px)
         if (a.name, b.name) != ("c0", "c1") or pair is None:
             return pair
         first, second = pair.cameras
         return rig._Pair((first, turned(second, 90, axis=1)), agreeing=10**6, angle_deg=60.0)
 
-    monkeypatch.setattr(rig, "_relative_pose", misled)
-    turn_deg, move_m = worst_errors(first_poses([lost(camera) for camera in truth], seen_by(truth, 0.5)), truth)
+    monkeypatch.setattr(rig, "_relative_pose", misleading)
+    turn_deg, move_m = worst_errors(first_poses([without_pose(camera) for camera in truth], seen_by(truth, 0.5)), truth)
     assert turn_deg < 0.1 and move_m < 0.01
 
 
-def test_a_common_focal_length_is_found_from_a_guess_that_is_far_off() -> None:
+def test_a_common_focal_length_is_found_from_a_poor_guess() -> None:
     truth = ring(4)
     keypoints = seen_by(truth, 0.5)
     K = np.array([[750.0, 0, 499.5], [0, 750, 499.5], [0, 0, 1]])
-    guess = [dataclasses.replace(lost(camera), K=K) for camera in truth]
+    guess = [dataclasses.replace(without_pose(camera), K=K) for camera in truth]
     fit, _ = fit_lenses(first_poses(guess, keypoints), keypoints, [c.name for c in truth], 0.02)
     assert fit.what == "one focal length"
     assert fit.cameras[0].K[0, 0] == pytest.approx(1000, rel=0.01)
 
 
-def test_a_distortion_is_found_where_held_out_keypoints_show_it() -> None:
+def test_a_distortion_is_found_if_held_out_keypoints_show_it() -> None:
     truth = ring(4)
     keypoints = seen_by(truth, 0.3)
     for points, camera in zip(keypoints, truth, strict=True):
         rays = (points[..., :2] - camera.K[:2, 2]) / 1000
         points[..., :2] = 1000 * rays * (1 - 0.2 * (rays**2).sum(-1, keepdims=True)) + camera.K[:2, 2]
     names = [camera.name for camera in truth]
-    fit, _ = fit_lenses(first_poses([lost(camera) for camera in truth], keypoints), keypoints, names, 0.02)
+    fit, _ = fit_lenses(first_poses([without_pose(camera) for camera in truth], keypoints), keypoints, names, 0.02)
     assert fit.what == "one focal length, one distortion"
     assert fit.k1 == pytest.approx(-0.2, abs=0.02)
 
@@ -96,13 +96,13 @@ def test_undistort_inverts_k1_by_hand() -> None:
     assert straight[0, 1].tolist() == [7, 7, 0]
 
 
-def test_scale_is_the_height() -> None:
+def test_the_height_sets_the_scale() -> None:
     cameras, points = scale_to(ring(3), 2 * walk_m(), STATURE_M)
-    assert np.allclose(points, walk_m(), atol=1e-3)  # the limbs' thickness is left out of 1.56 m
+    assert np.allclose(points, walk_m(), atol=1e-3)  # 1.56 m leaves out the limbs' thickness
     assert np.allclose(cameras[0].centre_m, ring(3)[0].centre_m / 2, atol=1e-3)
 
 
-def test_the_ground_lies_below_the_feet_whatever_the_world_was() -> None:
+def test_the_ground_is_put_below_the_feet_in_any_world() -> None:
     tumble = cv2.Rodrigues(np.array([1.0, 2.0, 0.5]))[0]
     cameras = [
         dataclasses.replace(c, R=c.R @ tumble.T, t_m=c.t_m - c.R @ tumble.T @ np.array([1.0, 2, 3])) for c in ring(4)
@@ -113,16 +113,16 @@ def test_the_ground_lies_below_the_feet_whatever_the_world_was() -> None:
     assert stood[0].centre_m[2] == pytest.approx(ring(4)[0].centre_m[2] - 0.02, abs=0.02)
 
 
-def test_a_person_who_leans_does_not_tilt_cameras_that_are_level() -> None:
+def test_a_leaning_person_does_not_tilt_level_cameras() -> None:
     lean = cv2.Rodrigues(np.array([0, np.deg2rad(20), 0]))[0]
     still = np.repeat((STANDING_M @ lean.T)[None], 12, axis=0)
     stood, _, up_sd_deg = stand_on_ground(ring(4), still, 1 / 30)
     assert max(abs(np.rad2deg(camera.R[0, 2])) for camera in stood) < 3
-    assert up_sd_deg > 2  # what contradicts itself is not certain
+    assert up_sd_deg > 2  # the person and the cameras disagree, so the vertical is uncertain
 
 
-def test_frames_of_one_step_count_as_one_at_any_rate() -> None:
-    """Every frame twice in half the time says the same; and frames half a second apart, no more than a second apart."""
+def test_frames_within_a_step_count_as_one_at_any_rate() -> None:
+    """Repeating every frame at twice the rate changes nothing. Half a second between frames counts like a whole one."""
     rolled = [dataclasses.replace(c, R=cv2.Rodrigues(np.array([0, 0, 0.1]))[0] @ c.R) for c in ring(4)]
     walk = walk_m() + np.random.default_rng(0).normal(0, 0.01, (12, 25, 3))
     once, twice, slow, slower = (
@@ -135,7 +135,7 @@ def test_frames_of_one_step_count_as_one_at_any_rate() -> None:
 
 def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) -> None:
     truth = ring(4)
-    capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
+    capture = write_capture(tmp_path, [without_pose(camera) for camera in truth], detections(truth, 1.0))
     found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M)
     turn_deg, move_m = worst_errors(found.cameras, truth)
     assert turn_deg < 0.3 and move_m < 0.02
@@ -148,11 +148,11 @@ def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) 
     assert np.allclose(read["c1"].R, found.cameras[1].R)
 
 
-def test_outlines_have_the_last_word_on_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Outlines that turn c1 by half a degree: the rig that is scaled and stood on the ground has it turned so. They are
-    told which focal lengths are unknown."""
+def test_poses_follow_outlines_before_scaling_and_grounding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Outlines turn c1 by half a degree, and it stays so in the rig that is scaled and put on the ground. The fit to
+    outlines gets the names of cameras with unknown focal lengths."""
     truth = ring(4)
-    capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 0.0))
+    capture = write_capture(tmp_path, [without_pose(camera) for camera in truth], detections(truth, 0.0))
 
     def follow(outlines: str, cameras: list[Camera], *others: object) -> tuple[list[Camera], str]:
         assert outlines == "found" and others[-1] == ["c0"]
@@ -164,10 +164,10 @@ def test_outlines_have_the_last_word_on_poses(tmp_path: Path, monkeypatch: pytes
     assert worst_errors(found.cameras, [turned(c, 0.5) if c.name == "c1" else c for c in truth])[0] < 0.1
 
 
-def test_the_rate_and_the_stride_of_a_recording_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every third frame at 60 a second: 50 ms apart."""
+def test_the_frame_interval_follows_from_rate_and_stride(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every third frame at 60 frames a second: 50 ms apart."""
     truth, asked = ring(3), []
-    capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
+    capture = write_capture(tmp_path, [without_pose(camera) for camera in truth], detections(truth, 1.0))
     capture = dataclasses.replace(capture, fps=60.0, train_frames=tuple(range(0, 36, 3)))
 
     def stood(cameras: list[Camera], points_m: np.ndarray, frame_s: float) -> tuple[list[Camera], np.ndarray, float]:
@@ -179,16 +179,16 @@ def test_the_rate_and_the_stride_of_a_recording_count(tmp_path: Path, monkeypatc
     assert asked == [pytest.approx(0.05)]
 
 
-def test_without_a_height_the_mean_is_taken_and_said(tmp_path: Path) -> None:
+def test_without_a_height_the_mean_is_used_and_reported(tmp_path: Path) -> None:
     truth = ring(3)
-    capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
+    capture = write_capture(tmp_path, [without_pose(camera) for camera in truth], detections(truth, 1.0))
     found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), None)
     assert found.scale_sd == pytest.approx(np.hypot(0.03, 0.09 / 1.65))
     assert found.notes()[0] == "scale: a person of 1.65 m, the mean of adults (give --height), +- 6 %"
 
 
-def test_a_lens_is_of_the_recorded_pictures(tmp_path: Path) -> None:
-    """Of 2000 px, shrunk to 1000 px: the focal length doubles, and the middle at 499.5 comes to 999.5."""
+def test_a_lens_is_given_for_images_of_the_recorded_size(tmp_path: Path) -> None:
+    """Images of 2000 px were shrunk to 1000 px: the focal length doubles, and the middle at 499.5 becomes 999.5."""
     capture = write_capture(tmp_path, ring(1), detections(ring(1), 0.0))
     capture = dataclasses.replace(capture, recorded_sizes_px={"c0": (2000, 2000)})
     lens = _as_recorded(capture, capture.cameras["c0"], -0.1)
@@ -197,7 +197,7 @@ def test_a_lens_is_of_the_recorded_pictures(tmp_path: Path) -> None:
 
 
 def refusal(tmp_path: Path, cameras: list[Camera], seen: dict[str, np.ndarray], unknown: list[str]) -> str:
-    capture = write_capture(tmp_path, [lost(camera) for camera in cameras], seen)
+    capture = write_capture(tmp_path, [without_pose(camera) for camera in cameras], seen)
     with pytest.raises(InputError) as refused:
         calibrate_from_person(capture, unknown, dict.fromkeys(capture.cameras, ""), 1.8)
     return str(refused.value)
@@ -209,8 +209,8 @@ def test_one_camera_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_joints_that_are_never_seen_do_not_count_as_still() -> None:
-    """Feet, which few detectors find, are never seen. All other joints are 0, 0.3 and 0.6 m along x: 0.3, 0 and 0.3 m
-    from their median place."""
+    """Feet, which few detectors find, are never seen. All other joints are at 0, 0.3 and 0.6 m along x: 0.3, 0 and
+    0.3 m from their median position."""
     points_m = STANDING_M + np.array([0, 0.3, 0.6])[:, None, None] * [1, 0, 0]
     points_m[:, 19:] = np.nan
     assert _motion(points_m) == pytest.approx(0.3 / STATURE_M, rel=1e-3)
@@ -221,14 +221,14 @@ def test_a_person_who_stands_still_is_refused(tmp_path: Path) -> None:
     assert "stands still" in refusal(tmp_path, ring(4), still, [])
 
 
-def test_cameras_in_one_line_of_sight_are_refused(tmp_path: Path) -> None:
+def test_cameras_that_look_along_one_line_are_refused(tmp_path: Path) -> None:
     line = [look_at(f"c{i}", np.array([3 + i, 0.02 * i, 1.2]), np.array([0, 0, 0.9])) for i in range(3)]
     assert "one direction" in refusal(tmp_path, line, detections(line, 1.0), [])
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_cameras_in_one_line_leave_the_focal_length_open(count: int, tmp_path: Path) -> None:
-    """Two cameras are in one line wherever they stand."""
+def test_cameras_in_one_line_cannot_find_the_focal_length(count: int, tmp_path: Path) -> None:
+    """Two cameras are always in one line."""
     line = [look_at(f"c{i}", np.array([3.5, 2.0 * i - 2, 1.2]), np.array([0, 0, 0.9])) for i in range(count)]
     said = refusal(tmp_path, line, detections(line, 1.0), [camera.name for camera in line])
     assert "one line" in said and said.endswith("give it (--fov or --lens), or add a camera beside that line")
@@ -240,20 +240,20 @@ def test_too_few_shared_keypoints_are_refused(tmp_path: Path) -> None:
     assert "camera c2 shares 50 keypoints" in refusal(tmp_path, ring(3), seen, [])
 
 
-def test_recordings_of_different_moments_are_refused(tmp_path: Path) -> None:
+def test_recordings_of_different_times_are_refused(tmp_path: Path) -> None:
     seen = detections(ring(4), 1.0)
     seen["c1"] = seen["c1"][[5, 2, 9, 0, 11, 7, 1, 10, 4, 8, 3, 6]]
     assert "camera c1" in refusal(tmp_path, ring(4), seen, [])
 
 
-def test_each_camera_takes_who_is_named_there_or_has_the_best_claim(tmp_path: Path) -> None:
-    """Two people walk beside each other, of whom the second is named in c0 and is a little larger in c1."""
+def test_each_camera_takes_the_named_person_or_the_best_candidate(tmp_path: Path) -> None:
+    """Two people walk side by side. The second is named in c0, and is a little larger in c1."""
     seen = detections(ring(2), 0.0)
     aside = np.array([200.0, 0, 0])
     both = {name: np.concatenate([found - aside, found + aside], 1) for name, found in seen.items()}
     middle = both["c1"][:, 1:, :, :2].mean(2, keepdims=True)
     both["c1"][:, 1:, :, :2] = middle + 1.05 * (both["c1"][:, 1:, :, :2] - middle)
-    capture = write_capture(tmp_path, [lost(camera) for camera in ring(2)], both)
+    capture = write_capture(tmp_path, [without_pose(camera) for camera in ring(2)], both)
     x, y, _ = both["c0"][3, 1, 0]
     capture = dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c0", 3))
     np.testing.assert_array_equal(_each_alone(capture), [both["c0"][:, 1], both["c1"][:, 1]])

@@ -1,4 +1,4 @@
-"""From a folder of pictures and keypoint files to calibration files and clocks, by the commands."""
+"""The commands that make calibration files and clocks from a folder of images and keypoint files."""
 
 import json
 import shutil
@@ -31,7 +31,7 @@ FRAMES = 12
 def write_recording(
     folder: Path, keypoints: dict[str, np.ndarray], pose2sim: bool = False, side_px: int = 1000
 ) -> Path:
-    """Write grey square pictures, and keypoints (frames, 25, 3) in files of OpenPose, by camera."""
+    """Write grey square images, and keypoints (frames, 25, 3) by camera as OpenPose files."""
     for name, frames in keypoints.items():
         place = folder / (f"pose/{name}_json" if pose2sim else f"openpose/{name}")
         pictures = folder / "images" / name
@@ -45,17 +45,17 @@ def write_recording(
 
 
 def in_this_process(read: Callable[..., None], *arguments: object, folder: Path) -> None:
-    """Read as `run_caged` does, not in a process of its own."""
+    """Read like `run_caged`, but in this process."""
     read(*arguments)
 
 
 @pytest.mark.parametrize("pose2sim", [False, True])
-def test_a_folder_gets_its_cameras(
+def test_the_command_calibrates_a_folder_from_the_person(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, pose2sim: bool
 ) -> None:
     monkeypatch.setattr("tasks.cage.run_caged", in_this_process)
     monkeypatch.setattr("hnerf.calibration.person.calibrate.FRAMES", 2)
-    if pose2sim:  # the other folder's outlines are looked for
+    if pose2sim:  # the other case looks for outlines
         monkeypatch.setattr(Outlines, "of", lambda *_: None)
     truth = ring(3)
     seen = {name: found[:, 0] for name, found in detections(truth, 1.0).items()}
@@ -68,14 +68,14 @@ def test_a_folder_gets_its_cameras(
     found = align([Camera(c.name, lenses[c.name].K, lenses[c.name].R, lenses[c.name].t_m, 1, 1) for c in truth], truth)
     assert max(np.linalg.norm(a.centre_m - b.centre_m) for a, b in zip(found, truth, strict=True)) < 0.03
     assert json.loads((out / "report.json").read_text())["cameras"]["c0"]["uncertainty"]["move_m"] < 0.1
-    shutil.copytree(out, folder, dirs_exist_ok=True)  # as the command says, to use them
+    shutil.copytree(out, folder, dirs_exist_ok=True)  # what the command says to do to use the cameras
     assert ingest(folder, CaptureSettings(), tmp_path / "ingested").has_keypoints
     again = Uncalibrated(folder, fov_deg=float(fov_deg))  # the same command does the same again
     assert {known.source for known in again.known_lenses.values()} == {"53.1301 degrees given"}
 
 
-def test_a_field_of_view_beside_the_lenses_of_all_cameras_is_refused(tmp_path: Path) -> None:
-    """As of a folder into which calibrated cameras were copied; their lenses would be taken."""
+def test_a_field_of_view_is_refused_if_all_lenses_are_known(tmp_path: Path) -> None:
+    """If calibrated cameras were copied into the folder, their lenses would be used instead."""
     folder = write_recording(tmp_path / "film", {"c0": np.ones((1, 25, 3)), "c1": np.ones((1, 25, 3))})
     write_easymocap(folder, [pinhole(camera) for camera in ring(2)])
     with pytest.raises(InputError, match=r"intri\.yml: has the lenses of all cameras, and --fov is for others"):
@@ -84,7 +84,7 @@ def test_a_field_of_view_beside_the_lenses_of_all_cameras_is_refused(tmp_path: P
     assert Uncalibrated(folder, fov_deg=60.0).known_lenses["c1"].source == "60 degrees given"
 
 
-def test_a_folder_gets_its_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_synchronises_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_recording(tmp_path / "film", {f"c{i}": filmed(i, 3.0, 0.5 * i).keypoints for i in range(2)})
     assert main(["synchronise", str(folder)]) == 0
     assert read_clocks(folder)["c1"].offset_s == pytest.approx(0.5, abs=0.1 / 30)
@@ -92,8 +92,8 @@ def test_a_folder_gets_its_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "remove it to synchronise again" in capsys.readouterr().err
 
 
-def test_tracks_are_in_pixels_of_the_recording(tmp_path: Path) -> None:
-    """Its pictures are shrunk to 1024 px."""
+def test_tracks_are_in_pixels_of_the_recorded_images(tmp_path: Path) -> None:
+    """Images are shrunk to 1024 px on reading."""
     seen = filmed(0, 0.1, 0.0).keypoints * [2.048, 2.048, 1]
     folder = write_recording(tmp_path / "film", {"c0": seen}, side_px=2048)
     track = _track(Uncalibrated(folder, only="c0"), "c0", 30.0, None, tmp_path)
@@ -101,9 +101,9 @@ def test_tracks_are_in_pixels_of_the_recording(tmp_path: Path) -> None:
     np.testing.assert_allclose(track.times_s, [0, 1 / 30, 2 / 30])
 
 
-def test_tracks_are_undistorted_once_by_a_lens_that_is_known(tmp_path: Path) -> None:
-    """At radius 0.4 a lens of k1 = 0.25 pictures 0.4 (1 + 0.04): 500 + 416 px is 500 + 400 without distortion. Images
-    that `intri.yml` undistorts have these pixels already."""
+def test_tracks_are_undistorted_only_once_by_a_known_lens(tmp_path: Path) -> None:
+    """A lens of k1 = 0.25 images radius 0.4 at 0.4 (1 + 0.04): 500 + 416 px is 500 + 400 without distortion. If
+    `intri.yml` undistorts the images, keypoints are undistorted already."""
     K, distortion = np.array([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]]), np.array([0.25, 0, 0, 0])
     lens = Lens("c0", K, distortion, np.eye(3), np.zeros(3), (1000, 1000))
     seen = np.broadcast_to([916.0, 500.0, 0.8], (3, 25, 3)) + 1e-3 * np.arange(25)[:, None] * [0, 1, 0]

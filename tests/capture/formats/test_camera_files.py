@@ -89,7 +89,7 @@ def test_hostile_colmap_models_are_refused(name: str, at: int, value: bytes, tmp
 
 
 def test_a_colmap_line_cut_short_is_refused(tmp_path: Path) -> None:
-    """Whatever is left of a line of images.txt: of ten parts, nine or fewer."""
+    """One to nine of the ten fields of a line of images.txt are left."""
     path = write_model(tmp_path) / "sparse" / "0" / "images.txt"
     line = next(line for line in IMAGES_TXT.splitlines() if line.endswith("01/000000.jpg"))
     for parts in range(1, 10):
@@ -107,7 +107,7 @@ def test_a_colmap_line_cut_short_is_refused(tmp_path: Path) -> None:
         ("7 0.7", "7 zero", "not a COLMAP model"),
     ],
 )
-def test_colmap_models_that_make_no_cameras_are_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_inconsistent_colmap_models_are_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
     path = write_model(tmp_path) / "sparse" / "0" / "images.txt"
     assert old in IMAGES_TXT
     path.write_text(IMAGES_TXT.replace(old, new))
@@ -119,7 +119,7 @@ def test_colmap_models_that_make_no_cameras_are_refused(old: str, new: str, mess
     ("layout", "reader"),
     [("colmap", Colmap), ("caliscope", Caliscope), ("aniposelib", Caliscope), ("easymocap", EasyMocap)],
 )
-def test_what_is_written_reads_back(layout: str, reader: type[Layout], tmp_path: Path) -> None:
+def test_written_cameras_are_read_back(layout: str, reader: type[Layout], tmp_path: Path) -> None:
     write_cameras(tmp_path, LENSES, layout)
     assert type(recognise(tmp_path)) is reader
     read = recognise(tmp_path).lenses()
@@ -133,10 +133,10 @@ def test_what_is_written_reads_back(layout: str, reader: type[Layout], tmp_path:
 
 
 @pytest.mark.parametrize(("layout", "reader"), [("colmap", Colmap), ("caliscope", Caliscope)])
-def test_intrinsics_beside_another_calibration_take_no_precedence(
+def test_intrinsics_next_to_another_calibration_do_not_take_precedence(
     layout: str, reader: type[Layout], tmp_path: Path
 ) -> None:
-    """Only with `extri.yml` are they a calibration."""
+    """`intri.yml` is a calibration only together with `extri.yml`."""
     write_cameras(tmp_path, LENSES, "easymocap")
     write_cameras(tmp_path, LENSES, layout)
     assert type(recognise(tmp_path)) is EasyMocap
@@ -145,7 +145,7 @@ def test_intrinsics_beside_another_calibration_take_no_precedence(
 
 
 @pytest.mark.parametrize("layout", ["colmap", "caliscope", "aniposelib"])
-def test_files_that_must_say_a_size_are_not_written_without(layout: str, tmp_path: Path) -> None:
+def test_formats_that_require_an_image_size_are_not_written_without_one(layout: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="camera cam_3 has no size; add W_cam_3 and H_cam_3"):
         write_cameras(tmp_path, [LENSES[0], dataclasses.replace(LENSES[1], size_px=None)], layout)
     assert list(tmp_path.iterdir()) == []
@@ -157,13 +157,13 @@ def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path) -> None:
     assert list(recognise(tmp_path).lenses()) == ["cam_0", "cam_1", "cam_2"]
 
 
-def test_skew_is_not_written_where_colmap_has_none(tmp_path: Path) -> None:
+def test_skew_cannot_be_written_for_colmap(tmp_path: Path) -> None:
     K = np.array([[1000.0, 40, 500], [0, 1000, 500], [0, 0, 1]])  # 40 px at one focal length off the axis
     with pytest.raises(InputError, match="camera 01: has skew"):
         write_colmap(tmp_path, [Lens("01", K, np.zeros(4), np.eye(3), np.zeros(3), (1000, 1000))])
 
 
-def test_colmap_sees_the_same_pixels(tmp_path: Path) -> None:
+def test_colmap_projects_to_the_same_pixels(tmp_path: Path) -> None:
     """A point that projects to pixel (319.5, 239.5) here projects to (320, 240) there."""
     write_cameras(tmp_path, LENSES, "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
@@ -185,12 +185,12 @@ def test_opencv_and_pose2sim_read_what_is_written(tmp_path: Path) -> None:
     assert np.allclose(Pose2Sim(tmp_path).lenses()["cam_3"].R, LENSES[1].R)
 
 
-def test_caliscope_cameras_that_are_ignored_stay_away(tmp_path: Path) -> None:
+def test_caliscope_cameras_marked_as_ignored_are_left_out(tmp_path: Path) -> None:
     write_cameras(tmp_path, LENSES, "caliscope")
     text = (tmp_path / "camera_array.toml").read_text().replace("ignore = false", "ignore = true", 1)
     (tmp_path / "camera_array.toml").write_text(text)
     assert list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4"]
-    for name in ("../3", "cam 3 "):  # OpenCV, which keeps the cameras that are used, drops a blank at the end
+    for name in ("../3", "cam 3 "):  # OpenCV, which stores the cameras in use, drops a space at the end
         (tmp_path / "camera_array.toml").write_text(text.replace("cam_id = 3", f'cam_id = "{name}"'))
         with pytest.raises(InputError, match="camera name"):
             recognise(tmp_path).lenses()
@@ -213,7 +213,7 @@ def test_a_colmap_capture_is_ingested_with_its_scale(tmp_path: Path) -> None:
     assert np.allclose(capture.cameras["02"].K, rec.K) and len(capture.frames) == len(rec.FRAMES)
 
 
-def test_the_command_line_converts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_exports_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_model(tmp_path / "model")
     (folder / "capture.toml").write_text('units = "mm"\n')
     assert main(["export-cameras", str(folder), "--format", "aniposelib", "--out", str(tmp_path / "out")]) == 0

@@ -1,4 +1,4 @@
-"""A PeopleSnapshot folder of six frames, in the files of the published subjects."""
+"""A PeopleSnapshot folder of six frames, with the same files as the published subjects."""
 
 import pickle
 from pathlib import Path
@@ -24,7 +24,7 @@ def write_hdf5(path: Path, **arrays: np.ndarray) -> None:
 
 
 def write_peoplesnapshot(folder: Path, frames: int, size_px: tuple[int, int]) -> Path:
-    """Write a recording; row i of the poses, of which there is one more, holds i, so that frame f has row f + 1; the
+    """Write a recording with one pose more than frames. Row i of the poses holds i, so that frame f has row f + 1; the
     last was never reconstructed."""
     width, height = size_px
     rec.write_video(folder / f"{folder.name}.mp4", frames, size_px)
@@ -69,7 +69,7 @@ def test_keypoints_are_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) 
     assert read == ["keypoints"]
 
 
-def test_masks_and_keypoints(capture: Capture) -> None:
+def test_masks_and_keypoints_are_read(capture: Capture) -> None:
     mask, keypoints = capture.given_mask("camera", 3), capture.keypoints("camera")
     assert mask is not None and mask[10:20, 20:30].all() and mask.sum() == 100
     assert keypoints is not None and keypoints[5, 0, 1].tolist() == [1, 2, 0.8]  # the neck
@@ -81,17 +81,15 @@ def test_given_poses_are_aligned_from_the_end(capture: Capture) -> None:
     given = capture.given_poses()
     assert given is not None and given.known.tolist() == [True] * 5 + [False]
     assert given.theta[0].ravel().tolist() == [1.0] * 72 and given.theta[4, 0].tolist() == [5.0] * 3
-    # SMPL's own origin, and its y axis, which in that camera's world points down
+    # SMPL's origin, and its y axis, which points down in the world of that camera
     assert given.root[0] @ [0, 0, 0, 1] == pytest.approx([0.1, 2.5, -0.2, 1])
     assert given.root[0] @ [0, 1, 0, 0] == pytest.approx([0, 0, -1, 0])
     assert given.betas.tolist() == list(range(10))
 
 
 @pytest.mark.parametrize("name", ["masks", "keypoints"])
-def test_more_rows_than_frames_are_refused_before_anything_is_made_of_them(
-    name: str, folder: Path, tmp_path: Path
-) -> None:
-    """A few kilobytes declare four thousand million rows: a dictionary of them fills any memory."""
+def test_more_rows_than_frames_are_refused_before_they_are_read(name: str, folder: Path, tmp_path: Path) -> None:
+    """A few kilobytes declare four billion rows; a dictionary of them would fill any memory."""
     with h5py.File(folder / f"{name}.hdf5", "r+") as file:
         row = file[name].shape[1:]
         del file[name]
@@ -100,8 +98,8 @@ def test_more_rows_than_frames_are_refused_before_anything_is_made_of_them(
         ingest(folder, CaptureSettings(), tmp_path / "out")
 
 
-def test_any_broken_byte_is_refused_or_harmless(folder: Path, tmp_path: Path) -> None:
-    """HDF5's own reader answers damage with a KeyError, a ValueError or an OSError."""
+def test_any_damaged_byte_is_refused_or_harmless(folder: Path, tmp_path: Path) -> None:
+    """On damage, HDF5's own reader raises KeyError, ValueError or OSError."""
     layout, stored = PeopleSnapshot(folder), (folder / "reconstructed_poses.hdf5").read_bytes()
     refused = 0
     for at in range(0, len(stored), 97):
@@ -113,14 +111,14 @@ def test_any_broken_byte_is_refused_or_harmless(folder: Path, tmp_path: Path) ->
     assert refused > 0
 
 
-def test_poses_beyond_all_bodies_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_impossibly_distant_poses_are_refused(folder: Path, tmp_path: Path) -> None:
     with h5py.File(folder / "reconstructed_poses.hdf5", "r+") as file:
         file["trans"][2] = 1e30
     with pytest.raises(InputError, match=r"reconstructed_poses\.hdf5: translations of a pose are NaN or beyond"):
         ingest(folder, CaptureSettings(), tmp_path / "out")
 
 
-def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
+def test_damaged_files_are_named(folder: Path, tmp_path: Path) -> None:
     def refused(names: str) -> None:
         with pytest.raises(InputError, match=names):
             ingest(folder, CaptureSettings(), tmp_path / "out")

@@ -19,7 +19,7 @@ from tests.shared_data import shared_capture
 
 @pytest.fixture(scope="module")
 def balance(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """One frame in eight of its 60, of which the last fifth is for novel poses."""
+    """Return the capture with one in eight of its 60 frames; the last fifth of the 60 is for novel poses."""
     folder = shared_capture("pose2sim-balance")
     return ingest(folder, CaptureSettings(max_side_px=256, max_frames=6), tmp_path_factory.mktemp("balance"))
 
@@ -27,12 +27,12 @@ def balance(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def test_real_detections_become_body_25(balance: Capture) -> None:
     keypoints = balance.keypoints("cam03")
     assert keypoints is not None and is_body_25(keypoints)
-    # He stands in portrait images: neck above hips above his standing leg's knee above its ankle, in every frame.
+    # The person is upright in every frame: neck above hips, hips above the standing leg's knee, knee above its ankle.
     person = keypoints[:, np.argmax(keypoints[..., 2].sum(-1).mean(0))]
     assert (np.diff(person[:, [1, 8, 13, 14], 1], axis=1) > 0).all()
 
 
-def test_files_that_hold_body_25_already_are_left_alone(balance: Capture) -> None:
+def test_body_25_keypoints_are_left_unchanged(balance: Capture) -> None:
     keypoints = balance.keypoints("cam03")
     assert keypoints is not None and np.array_equal(to_body_25({"cam03": keypoints}, None)["cam03"], keypoints)
 
@@ -54,7 +54,7 @@ def test_both_narrow_videos_are_matched_by_their_bars(balance: Capture) -> None:
         assert area.height == pytest.approx(1920 * 1080 / 1088, abs=0.1)
 
 
-def test_keypoints_and_videos_of_no_calibrated_camera_are_told(
+def test_keypoints_and_videos_of_uncalibrated_cameras_get_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = rec.write_pose2sim(tmp_path / "film")
@@ -70,8 +70,8 @@ def test_keypoints_and_videos_of_no_calibrated_camera_are_told(
     ]
 
 
-def test_keypoint_files_follow_the_numbers_in_their_names(tmp_path: Path) -> None:
-    """Digits of other scripts are letters."""
+def test_keypoint_files_are_sorted_by_the_numbers_in_their_names(tmp_path: Path) -> None:
+    """Digits of other scripts count as letters."""
     folder = tmp_path / "pose" / "a_json"
     folder.mkdir(parents=True)
     for name in ("walk_10", "walk_9", "walk_\u0663", "\u0663"):
@@ -80,8 +80,8 @@ def test_keypoint_files_follow_the_numbers_in_their_names(tmp_path: Path) -> Non
     assert [Path(str(file)).stem for file in files.values()] == ["walk_9", "walk_10", "walk_\u0663", "\u0663"]
 
 
-def test_keypoints_go_with_numbered_images(tmp_path: Path) -> None:
-    """Images 3 to 12 and ten files of keypoints, numbered otherwise, and masks beside them."""
+def test_keypoint_files_are_matched_to_numbered_images(tmp_path: Path) -> None:
+    """There are images 3 to 12 with masks, and ten keypoint files that are numbered differently."""
     folder = rec.write_pose2sim(tmp_path / "walker")
     for written in ("videos", "pose"):
         shutil.rmtree(folder / written)
@@ -98,7 +98,7 @@ def test_keypoints_go_with_numbered_images(tmp_path: Path) -> None:
     assert found.has_given_mask("cam01", 3)
 
 
-def test_keypoints_stay_where_another_calibration_takes_over(tmp_path: Path) -> None:
+def test_keypoints_are_kept_if_another_calibration_takes_precedence(tmp_path: Path) -> None:
     folder = rec.write_pose2sim(tmp_path / "walker")
     for camera in rec.CAMERAS:
         for frame in range(10):

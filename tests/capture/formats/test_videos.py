@@ -1,4 +1,4 @@
-"""Videos without calibration: one is a capture, several need cameras."""
+"""Videos without calibration: one is a capture, several need calibrated cameras."""
 
 import logging
 from pathlib import Path
@@ -22,13 +22,13 @@ def clip(tmp_path: Path) -> Path:
     return tmp_path / "my clip.mp4"
 
 
-def test_one_file_is_a_capture(clip: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """64 x 48 px, a focal length of 0.85 of the longer side: 54.4 px."""
+def test_a_single_video_is_a_capture(clip: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """At 64 x 48 px, the focal length is 0.85 of the longer side: 54.4 px."""
     with caplog.at_level(logging.WARNING):
         ingest(clip, SETTINGS, tmp_path / "out")
     found = Capture.load(tmp_path / "out")
     assert "longer side sees 61 degrees, is assumed" in caplog.text
-    assert "in capture.toml, in a folder with the video" in caplog.text  # what lies beside a file is not read
+    assert "in capture.toml, in a folder with the video" in caplog.text  # files next to it are not read
     camera = found.cameras["my clip"]
     assert found.name == "my clip" and found.frames == (0, 1, 2, 3, 4, 5) and not found.has_keypoints
     np.testing.assert_allclose(camera.K, [[54.4, 0, 31.5], [0, 54.4, 23.5], [0, 0, 1]], atol=1e-3)
@@ -48,19 +48,21 @@ def test_one_file_is_a_capture(clip: Path, tmp_path: Path, caplog: pytest.LogCap
         ("Zoe\u0308.mp4", "Zo\u00eb", "Zo\u00eb"),
     ],
 )
-def test_a_file_may_be_called_as_phones_call_it(tmp_path: Path, file: str, subject: str, camera: str) -> None:
+def test_file_names_given_by_phones_are_accepted(tmp_path: Path, file: str, subject: str, camera: str) -> None:
     write_video(tmp_path / "x.mp4", 3)
     found = ingest((tmp_path / "x.mp4").rename(tmp_path / file), SETTINGS, tmp_path / "out")
     assert found.name == subject and found.train_cameras == (camera,)
 
 
-def test_a_name_that_is_too_long_is_the_files(clip: Path, tmp_path: Path) -> None:
+def test_a_file_name_that_is_too_long_is_refused(clip: Path, tmp_path: Path) -> None:
     long = clip.rename(clip.with_name("a" * 129 + ".mp4"))
     assert "aaa.mp4: name 'aaaa" in refused(long, tmp_path / "out")
 
 
 @pytest.mark.parametrize("place", ["videos/front.MP4", "front.mov", "videos/front.mp4"])
-def test_a_folder_states_the_field_of_view(place: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_field_of_view_may_be_stated_in_a_folder(
+    place: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """90 degrees: the focal length is half the longer side."""
     folder = tmp_path / "ada"
     write_video(tmp_path / "clip.mp4", 3, (48, 64))
@@ -86,8 +88,8 @@ def test_the_world_of_one_camera_has_z_up(tmp_path: Path) -> None:
     assert message in refused(tmp_path / "ada", tmp_path / "out")
 
 
-def test_what_is_known_of_a_lone_video_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Its lens, keypoints, masks and clean plate, in EasyMocap's layout; the lens of another camera is refused."""
+def test_known_data_of_a_single_video_are_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Lens, keypoints, masks and plate in EasyMocap's layout are read; the lens of another camera is refused."""
     folder = tmp_path / "ada"
     write_video(folder / "videos" / "01.mp4", 3, (WIDTH, HEIGHT))
     write_calibration(folder)
@@ -114,11 +116,11 @@ def test_what_is_known_of_a_lone_video_is_read(tmp_path: Path, caplog: pytest.Lo
 def test_several_videos_need_cameras(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_video(tmp_path / "ada" / f"{name}.mp4", 3)
-    (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')  # which holds once there are cameras
+    (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')  # applies once there are cameras
     assert "--from person` finds their cameras" in refused(tmp_path / "ada", tmp_path / "out")
 
 
-def test_videos_beside_their_calibration_are_read(tmp_path: Path) -> None:
+def test_videos_next_to_their_calibration_are_read(tmp_path: Path) -> None:
     folder = tmp_path / "ada"
     folder.mkdir()
     write_calibration(folder)
@@ -127,7 +129,7 @@ def test_videos_beside_their_calibration_are_read(tmp_path: Path) -> None:
     assert ingest(folder, SETTINGS, tmp_path / "out").train_cameras == ("01", "02")
 
 
-def test_what_is_no_video(tmp_path: Path) -> None:
+def test_files_that_are_not_videos_are_refused(tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(b"0" * 1000)
     (tmp_path / "notes.txt").write_text("seen")
     assert "clip.mp4: not a readable video" in refused(tmp_path / "clip.mp4", tmp_path / "out")

@@ -17,8 +17,7 @@ CAMERAS = ("Camera_B1", "Camera_B2")
 
 
 def write_zju(folder: Path, names: tuple[str, ...] = CAMERAS, frame: str = "{:06d}.jpg") -> Path:
-    """Write the cameras of recordings.py, translations in mm; in masks the person's left half has label 3; frames 0 and
-    2 have poses."""
+    """Write the cameras of recordings.py with translations in mm, and masks whose left half has label 3."""
     rows = [[f"{name}/" + frame.format(f) for name in names] for f in range(3)]
     for row in rows:
         for path in row:
@@ -39,7 +38,7 @@ def write_zju(folder: Path, names: tuple[str, ...] = CAMERAS, frame: str = "{:06
 
 
 def write_parameters(path: Path, poses: np.ndarray, **others: Any) -> None:
-    """Write a pose turned a quarter about the vertical, then moved by (1, 2, 3) m."""
+    """Write a pose with a quarter turn about the vertical, then a move by (1, 2, 3) m."""
     path.parent.mkdir(exist_ok=True)
     parameters: Any = {"poses": poses, "Rh": np.array([[0, 0, np.pi / 2]]), "Th": np.array([[1.0, 2, 3]])}
     np.save(path, parameters | {"shapes": np.arange(10.0)[None]} | others, allow_pickle=True)  # type: ignore[arg-type]
@@ -51,7 +50,7 @@ def folder(tmp_path: Path) -> Path:
     return write_zju(tmp_path / "zju")
 
 
-def test_cameras_images_and_masks(folder: Path, tmp_path: Path) -> None:
+def test_cameras_images_and_masks_are_read(folder: Path, tmp_path: Path) -> None:
     capture = ingest(folder, CaptureSettings(), tmp_path / "out")
     assert capture.train_cameras == CAMERAS and capture.train_frames == (0, 1, 2)
     assert capture.cameras["Camera_B1"].centre_m == pytest.approx([-3, 0, 1], abs=1e-9)
@@ -62,7 +61,7 @@ def test_cameras_images_and_masks(folder: Path, tmp_path: Path) -> None:
 
 
 def test_cameras_may_lack_masks(folder: Path, tmp_path: Path) -> None:
-    """Camera_B1 has none, and those of Camera_B2 lie in mask/, beside an empty mask_cihp/."""
+    """Camera_B1 has none; those of Camera_B2 are in mask/, next to an empty mask_cihp/."""
     (folder / "mask_cihp").rename(folder / "mask")
     (folder / "mask_cihp").mkdir()
     shutil.rmtree(folder / "mask" / "Camera_B1")
@@ -70,8 +69,8 @@ def test_cameras_may_lack_masks(folder: Path, tmp_path: Path) -> None:
     assert capture.given_mask("Camera_B1", 0) is None and capture.given_mask("Camera_B2", 0) is not None
 
 
-def test_given_poses(folder: Path, tmp_path: Path) -> None:
-    """new_params override params; frame 1 has none; 69 turns leave out the pelvis."""
+def test_given_poses_are_read(folder: Path, tmp_path: Path) -> None:
+    """new_params/ overrides params/, so frame 1 has no pose. 69 angles leave out the pelvis."""
     turns = np.arange(72.0) * (np.arange(72) >= 3)
     write_parameters(folder / "new_params" / "0.npy", turns[None])
     write_parameters(folder / "new_params" / "2.npy", turns[3:])
@@ -84,17 +83,17 @@ def test_given_poses(folder: Path, tmp_path: Path) -> None:
     assert given.betas.tolist() == list(range(10))
 
 
-def test_the_published_cameras_are_for_training(tmp_path: Path) -> None:
+def test_training_cameras_are_those_of_published_work(tmp_path: Path) -> None:
     (tmp_path / "zju").mkdir()
     names = tuple(f"Camera ({k})" for k in range(1, 22))
     frame = "CoreView_313_Camera_(1)_{:04d}_2019-08-23_16-08-50.592.jpg"
     capture = ingest(write_zju(tmp_path / "zju", names, frame), CaptureSettings(), tmp_path / "out")
     assert capture.train_cameras == ("Camera (1)", "Camera (7)", "Camera (13)", "Camera (19)")
     assert len(capture.test_cameras) == 17 and capture.train_frames == (0, 1, 2)
-    assert all(capture.given_mask(name, 2) is not None for name in capture.test_cameras)  # which score them
+    assert all(capture.given_mask(name, 2) is not None for name in capture.test_cameras)  # masks are for scoring
 
 
-def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
+def test_damaged_files_are_named(folder: Path, tmp_path: Path) -> None:
     def refused(names: str) -> None:
         with pytest.raises(InputError, match=names):
             ingest(folder, CaptureSettings(), tmp_path / "out")
@@ -123,7 +122,7 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stray", ["Camera_B1/000001.jpg", "Camera_B2/000002.jpg"])
 def test_images_of_another_camera_or_frame_are_refused(stray: str, folder: Path, tmp_path: Path) -> None:
-    """Rows, but the first, could exchange cameras, and columns, but the first, frames."""
+    """Any row but the first could exchange cameras, and any column but the first could exchange frames."""
     annotations = np.load(folder / "annots.npy", allow_pickle=True).item()
     annotations["ims"][1]["ims"][1] = stray
     np.save(folder / "annots.npy", annotations, allow_pickle=True)
@@ -139,7 +138,7 @@ def test_frames_that_are_no_numbers_of_up_to_nine_digits_are_refused(name: str, 
 
 
 def test_exported_cameras_have_the_size_of_their_images(folder: Path) -> None:
-    """annots.npy states none; translations are in metres already."""
+    """annots.npy states no size; translations are already in metres."""
     lenses = exported_lenses(folder)
     assert [(lens.size_px, lens.t_m.tolist()) for lens in lenses] == [((rec.WIDTH, rec.HEIGHT), [0, 1, 3])] * len(
         lenses
