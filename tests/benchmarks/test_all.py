@@ -25,20 +25,18 @@ while len((Path(store) / "calls").read_text().split()) < 2:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checkout:
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # else a program rewritten in the same second runs as it was
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # or old bytecode runs within the same second
     monkeypatch.setattr(module, "POLL_S", 0.02)
     return Checkout(tmp_path)
 
 
 def before_writing(checkout: Checkout, lines: str) -> None:
-    """Have the program run a statement after it has recorded its call."""
+    """Make the program run these lines after it has recorded its call."""
     checkout.write("benchmarks/program.py", PROGRAM.replace("results =", f"{lines}\nresults ="))
     checkout.commit()
 
 
-def test_what_is_fresh_is_passed_over_and_what_is_not_is_made(
-    checkout: Checkout, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_stale_results_are_made_and_fresh_ones_skipped(checkout: Checkout, capsys: pytest.CaptureFixture[str]) -> None:
     assert make(checkout.root, [ONE, TWO], checkout.store, 1) == 0
     assert checkout.calls() == ["one", "two"]
     record = load_records(checkout.root)["one"]
@@ -52,7 +50,7 @@ def test_what_is_fresh_is_passed_over_and_what_is_not_is_made(
     assert capsys.readouterr().out.splitlines()[-2:] == ["one: fresh", "two: fresh"]
 
 
-def test_changed_code_makes_a_result_anew_and_keeps_the_time_of_the_whole_work(checkout: Checkout) -> None:
+def test_changed_code_remakes_a_result_and_keeps_its_time_unless_the_store_is_new(checkout: Checkout) -> None:
     make(checkout.root, [ONE], checkout.store, 1)
     first = load_records(checkout.root)["one"]
     checkout.write("hnerf/far.py", "NUMBER = 2\n")
@@ -71,8 +69,8 @@ def test_changed_code_makes_a_result_anew_and_keeps_the_time_of_the_whole_work(c
 
 
 @pytest.mark.parametrize("used", [True, False])
-def test_the_time_is_of_the_whole_work_unless_the_store_held_a_training_of_it(checkout: Checkout, used: bool) -> None:
-    """Let the store have a training of an hour ago, which is looked up by touching its record."""
+def test_no_time_is_recorded_if_the_store_already_had_a_training(checkout: Checkout, used: bool) -> None:
+    """The store has a training that is an hour old; using it touches its record."""
     folder = checkout.store / "training" / "a"
     folder.mkdir(parents=True)
     folder.with_suffix(".json").touch()
@@ -91,7 +89,7 @@ def test_a_checkout_with_changes_is_refused(checkout: Checkout) -> None:
     assert checkout.calls() == []
 
 
-def test_an_interrupted_run_goes_on_where_it_was(checkout: Checkout, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_resumes_where_it_stopped(checkout: Checkout, monkeypatch: pytest.MonkeyPatch) -> None:
     before_writing(checkout, WAITS)
     slow, sleep = made("slow"), time.sleep
 
@@ -113,7 +111,7 @@ def test_an_interrupted_run_goes_on_where_it_was(checkout: Checkout, monkeypatch
     assert load_records(checkout.root)["slow"]["seconds"] > spent_s
 
 
-def test_one_that_fails_is_told_at_the_end_and_others_go_on(
+def test_a_failure_is_reported_at_the_end_and_others_continue(
     checkout: Checkout, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before_writing(checkout, "if name == 'bad':\n    print('broken', file=sys.stderr)\n    sys.exit(3)")
@@ -132,7 +130,7 @@ def test_code_that_changes_while_it_runs_gives_no_result(
     assert "its code was changed while it ran" in capsys.readouterr().err
 
 
-def test_files_that_are_no_longer_written_go_and_none_is_a_failure(
+def test_files_no_longer_written_are_removed_and_writing_none_is_a_failure(
     checkout: Checkout, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checkout.write("benchmarks/results/one-old.md", "1")
@@ -146,7 +144,9 @@ def test_files_that_are_no_longer_written_go_and_none_is_a_failure(
     assert "wrote no file named nothing.md" in capsys.readouterr().err
 
 
-def test_absent_captures_and_cores_leave_a_result_out(checkout: Checkout, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_that_lack_captures_or_cores_are_left_out(
+    checkout: Checkout, capsys: pytest.CaptureFixture[str]
+) -> None:
     far, wide = made("far", captures=("absent",)), made("wide", threads=2)
     assert make(checkout.root, [far, wide], checkout.store, 1) == 0
     assert checkout.calls() == []
@@ -157,12 +157,12 @@ def test_absent_captures_and_cores_leave_a_result_out(checkout: Checkout, capsys
     assert checkout.calls() == ["far", "wide"]
 
 
-def test_two_jobs_run_side_by_side(checkout: Checkout) -> None:
+def test_two_jobs_run_in_parallel(checkout: Checkout) -> None:
     before_writing(checkout, MEETS)
     assert make(checkout.root, [ONE, TWO], checkout.store, 2) == 0
 
 
-def test_new_is_a_folder_of_this_result_and_this_code(checkout: Checkout) -> None:
+def test_the_argument_new_is_a_folder_for_this_result_and_code(checkout: Checkout) -> None:
     before_writing(checkout, "(Path(store) / 'kept').touch()")
     timed = type(ONE)("a/b", ("program.py", "b", "{new}"), ("b.md",))
     assert make(checkout.root, [timed], checkout.store, 1) == 0
@@ -170,7 +170,7 @@ def test_new_is_a_folder_of_this_result_and_this_code(checkout: Checkout) -> Non
     assert (checkout.store / f"a-b-{digest[:12]}" / "kept").exists()
 
 
-def test_the_list_says_what_is_fresh_and_why_not(checkout: Checkout) -> None:
+def test_the_list_shows_which_results_are_fresh_and_why_others_are_not(checkout: Checkout) -> None:
     make(checkout.root, [ONE], checkout.store, 1)
     record = load_records(checkout.root)["one"]
     lines = module.listing(checkout.root, [ONE, TWO])

@@ -17,7 +17,7 @@ from tests.calibration.test_refine import OutlinesCosting
 def test_a_trial_refines_a_turned_camera_with_outlines_collected_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The stage asks for outlines of few frames as evidence, and of FRAMES where a camera was refined."""
+    """The stage collects outlines of few frames as evidence, and of FRAMES if a camera was refined."""
     whole, collected = write_capture(tmp_path, ring(4), detections(ring(4), 1)), []
 
     def collect(capture: object, *frames: int) -> OutlinesCosting:

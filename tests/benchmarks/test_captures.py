@@ -1,4 +1,4 @@
-"""What programs make of captures: copies that lack folders, and parts."""
+"""Copies of captures without some folders, and sizes of parts of captures."""
 
 from pathlib import Path
 
@@ -7,8 +7,8 @@ from scaling import parts_of
 from score_shared import lacking
 
 
-def test_a_copy_lacks_the_folders_that_are_left_out_now_and_nothing_else(tmp_path: Path) -> None:
-    """Leave out `background`, then `masks`, of which `ground_truth` has some as well."""
+def test_a_copy_lacks_only_the_folders_that_are_left_out(tmp_path: Path) -> None:
+    """Leave out `background`, then `masks`; `ground_truth` has a folder of that name, too."""
     capture, store = tmp_path / "ada", tmp_path / "store"
     for folder in ("images", "background", "masks", "ground_truth/masks"):
         (capture / folder).mkdir(parents=True)
@@ -22,6 +22,6 @@ def test_a_copy_lacks_the_folders_that_are_left_out_now_and_nothing_else(tmp_pat
 
 
 @pytest.mark.parametrize(("whole", "parts"), [(1, []), (2, [1]), (3, [1, 2]), (4, [1, 2]), (24, [6, 12])])
-def test_parts_of_few_cameras_or_frames(whole: int, parts: list[int]) -> None:
-    """Round halves to even numbers: a quarter of two is none, and half of one is none."""
+def test_parts_of_a_number_of_cameras_or_frames(whole: int, parts: list[int]) -> None:
+    """Halves are rounded to even numbers: a quarter of two is none, and half of one is none."""
     assert parts_of(whole) == parts

@@ -18,7 +18,7 @@ def checkout(tmp_path: Path) -> Checkout:
     return Checkout(tmp_path)
 
 
-def test_sources_are_the_program_and_what_it_imports_at_any_remove(checkout: Checkout) -> None:
+def test_sources_are_the_program_and_its_direct_and_indirect_imports(checkout: Checkout) -> None:
     names = [str(path.relative_to(checkout.root)) for path in sources(checkout.root, ONE)]
     assert names == ["benchmarks/program.py", "hnerf/__init__.py", "hnerf/far.py", "hnerf/near.py"]
 
@@ -49,7 +49,7 @@ def test_only_used_code_and_settings_change_the_digest(checkout: Checkout, name:
         "NUMBER = 1\nimport hnerf.unused as other\n",
     ],
 )
-def test_modules_imported_late_or_started_by_name_count(checkout: Checkout, text: str) -> None:
+def test_modules_imported_late_or_started_by_name_are_sources(checkout: Checkout, text: str) -> None:
     checkout.write("hnerf/far.py", text)
     assert checkout.root / "hnerf" / "unused.py" in sources(checkout.root, ONE)
 
@@ -62,11 +62,11 @@ def test_programs_import_their_neighbours_and_packages_do_not(checkout: Checkout
     assert neighbour in sources(checkout.root, ONE)
 
 
-def test_a_program_that_is_started_counts_as_told(checkout: Checkout) -> None:
+def test_modules_listed_as_started_are_sources(checkout: Checkout) -> None:
     assert checkout.root / "hnerf" / "unused.py" in sources(checkout.root, made("one", runs=("hnerf.unused",)))
 
 
-def test_the_command_counts(checkout: Checkout) -> None:
+def test_the_command_changes_the_digest(checkout: Checkout) -> None:
     assert code_digest(checkout.root, made("one")) != code_digest(checkout.root, made("two"))
 
 
@@ -79,7 +79,7 @@ def _edit(path: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", [_remove, _edit])
-def test_a_result_is_stale_where_its_files_are_not_as_they_were_made(
+def test_a_result_is_stale_if_its_files_were_removed_or_edited(
     checkout: Checkout, harm: Callable[[Path], None]
 ) -> None:
     checkout.write("benchmarks/results/one.md", "1")
@@ -96,13 +96,13 @@ def test_a_result_is_stale_where_its_files_are_not_as_they_were_made(
 sha256_of_1 = "6b86b273ff34fce19d6b804eff5a3f5747ada4eaa22f1d49c01e52ddb7875b4b"  # printf 1 | sha256sum
 
 
-def test_every_committed_file_is_of_one_result() -> None:
+def test_every_committed_file_belongs_to_one_result() -> None:
     files = [path for path in RESULTS.rglob("*") if path.is_file() and path.stem != "provenance"]
     owners = {path: [r.name for r in REGISTRY for f in r.files if path in RESULTS.glob(f)] for path in files}
     assert {str(path): names for path, names in owners.items() if len(names) != 1} == {}
 
 
-def test_every_entry_names_a_program_settings_and_itself_once() -> None:
+def test_entries_have_unique_names_and_existing_programs_and_settings() -> None:
     assert len({result.name for result in REGISTRY}) == len(REGISTRY)
     for result in REGISTRY:
         assert (ROOT / "benchmarks" / result.command[0]).is_file()
@@ -110,7 +110,7 @@ def test_every_entry_names_a_program_settings_and_itself_once() -> None:
             assert any((ROOT / "configs").glob(f"{pattern}.yaml")), f"{result.name}: no configs/{pattern}.yaml"
 
 
-def test_a_training_is_among_what_a_study_depends_on() -> None:
+def test_sources_of_a_study_include_those_of_training() -> None:
     study = next(result for result in REGISTRY if result.name == "benchmark/valid-wave-static")
     names = {str(path.relative_to(ROOT)) for path in sources(ROOT, study)}
     assert {"hnerf/training/run.py", "tasks/rank.py", "hnerf/baselines/idr.py", "benchmarks/provenance.py"} <= names

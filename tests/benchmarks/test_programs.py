@@ -1,4 +1,4 @@
-"""Every program of results shows its docstring when asked for help, and measures nothing."""
+"""Every program that makes results shows its docstring on --help, and measures nothing."""
 
 import importlib
 import sys
@@ -9,8 +9,8 @@ from registry import REGISTRY
 
 PROGRAMS = sorted({result.command[0].removesuffix(".py") for result in REGISTRY})
 STORE = ("store",)
-REFUSED = 77  # no exit code of argparse
-POSITIONAL = {  # arguments of those that need some
+REFUSED = 77  # not an exit code of argparse
+POSITIONAL = {  # arguments of programs that need some
     "budget": STORE,
     "fit": STORE,
     "gpu": ("subject", "capture", "out"),

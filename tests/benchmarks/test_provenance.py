@@ -23,7 +23,7 @@ def test_a_checkout_with_changes_is_refused(tmp_path: Path, name: str, capsys: p
     assert len(provenance.clean_commit(checkout.root)) == 12
 
 
-def test_changed_results_are_no_change(tmp_path: Path) -> None:
+def test_changed_results_do_not_count_as_uncommitted_changes(tmp_path: Path) -> None:
     checkout = Checkout(tmp_path)
     checkout.write("benchmarks/results/one.md", "1")
     assert provenance.clean_commit(checkout.root)

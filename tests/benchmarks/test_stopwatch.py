@@ -9,13 +9,13 @@ from stopwatch import Stopwatch
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Return the time, as the only item."""
+    """Return a list whose only item is the time."""
     now = [100.0]
     monkeypatch.setattr(stopwatch.time, "monotonic", lambda: now[0])
     return now
 
 
-def test_an_interrupted_run_of_the_same_code_goes_on(tmp_path: Path, clock: list[float]) -> None:
+def test_time_of_an_interrupted_run_of_the_same_code_is_added(tmp_path: Path, clock: list[float]) -> None:
     first = Stopwatch(tmp_path / "state.json", "a")
     clock[0] = 130.0
     first.save(done=False)
@@ -25,7 +25,7 @@ def test_an_interrupted_run_of_the_same_code_goes_on(tmp_path: Path, clock: list
     assert (second.seconds, second.is_complete, second.began) == (42.0, True, first.began)
 
 
-def test_a_killed_run_has_lost_ten_seconds_at_most(tmp_path: Path, clock: list[float]) -> None:
+def test_a_killed_run_loses_at_most_ten_seconds(tmp_path: Path, clock: list[float]) -> None:
     killed = Stopwatch(tmp_path / "state.json", "a")
     for clock[0] in (109.0, 111.0, 115.0):
         killed.tick()
@@ -33,7 +33,7 @@ def test_a_killed_run_has_lost_ten_seconds_at_most(tmp_path: Path, clock: list[f
 
 
 @pytest.mark.parametrize(("digest", "done"), [("b", False), ("a", True)])
-def test_what_other_code_or_a_finished_run_left_is_not_timed(
+def test_time_of_other_code_or_of_a_finished_run_is_not_added(
     tmp_path: Path, clock: list[float], digest: str, done: bool
 ) -> None:
     first = Stopwatch(tmp_path / "state.json", "a")

@@ -25,7 +25,7 @@ def test_a_triangle_between_pixel_centres_covers_nothing() -> None:
     assert not silhouette(CAMERA, between_m, np.array([[0, 1, 2]])).any()
 
 
-def test_what_reaches_behind_the_camera_is_left_out() -> None:
+def test_a_triangle_that_reaches_behind_the_camera_is_left_out() -> None:
     behind_m = np.array([[0.0, 0, -1], [3, 0, 10], [0, 3, 10]])
     assert not silhouette(CAMERA, behind_m, np.array([[0, 1, 2]])).any()
 

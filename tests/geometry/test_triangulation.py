@@ -34,9 +34,9 @@ def test_residual_by_hand() -> None:
     np.testing.assert_allclose(points_m[0], [0.5, 0.2, 2], atol=4e-3)
 
 
-def test_a_near_camera_counts_by_its_pixels_wherever_the_world_begins() -> None:
-    """Cameras 1 m and 4 m before the point put it at x = 0 and x = 17 mm, a third one at its side fixes the depth:
-    least squares in pixels weigh the two by 1 and 1/16, so x = 17 / 16 / (1 + 1 / 16) = 1 mm."""
+def test_points_minimise_pixel_errors_wherever_the_world_origin_is() -> None:
+    """Cameras 1 m and 4 m in front of the point see it at x = 0 and x = 17 mm; a third one at its side determines the
+    depth. Least squares in pixels weight the two by 1 and 1/16, so x = 17 / 16 / (1 + 1 / 16) = 1 mm."""
     aside = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # looks along x
     poses = [(np.eye(3), [0.0, 0, 9]), (np.eye(3), [0.0, 0, 6]), (aside, [-1.0, 0, 10])]
     projections = np.stack([np.diag([100.0, 100, 1]) @ R @ np.c_[np.eye(3), -np.array(centre)] for R, centre in poses])
@@ -44,9 +44,10 @@ def test_a_near_camera_counts_by_its_pixels_wherever_the_world_begins() -> None:
     np.testing.assert_allclose(solve_points(projections, keypoints, np.ones((3, 1))), [[0.001, 0, 10]], atol=2e-4)
 
 
-def test_a_pair_of_surer_views_wins_over_one_in_larger_images() -> None:
-    """Two views with a focal length of 100 px see a point 4 m ahead; two of 200 px, a tenth as sure, one 0.1 m beside.
-    The first pair is 5 px off in the others, 2 x 0.1 x 5 = 1; the second 2.5 px in the first, 2 x 1 x 2.5 = 5."""
+def test_a_pair_of_more_confident_views_wins_over_one_in_larger_images() -> None:
+    """Two views with a focal length of 100 px see a point 4 m ahead; two of 200 px, with a tenth of the confidence, see
+    it 0.1 m off. The first pair's point is 5 px off in the other two views: a cost of 2 x 0.1 x 5 = 1. The second
+    pair's is 2.5 px off in the first two: a cost of 2 x 1 x 2.5 = 5."""
     projections = np.stack([
         np.diag([focal, focal, 1]) @ np.c_[np.eye(3), [-x_m, 0, 0]]
         for x_m, focal in ((-1, 100.0), (1, 100.0), (-2, 200.0), (2, 200.0))
@@ -57,7 +58,7 @@ def test_a_pair_of_surer_views_wins_over_one_in_larger_images() -> None:
     assert in_pair[:, 0].tolist() == [True, True, False, False]
 
 
-def test_an_outlier_view_is_left_out_and_its_residual_told() -> None:
+def test_an_outlier_view_is_left_out_and_its_residual_reported() -> None:
     cameras = ring(4)
     keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=0).values()])
     keypoints[2, 0, :2] += [30, 40]
@@ -89,12 +90,12 @@ def test_noise_averages_out() -> None:
 
 @pytest.mark.parametrize(("stride", "missed"), [(1, slice(4, 7)), (5, slice(0))])
 @pytest.mark.parametrize(("cameras", "surer_in"), [(1, 0), (3, 0), (4, 0), (4, 2)])
-def test_nobody_else_is_taken_for_the_subject(
+def test_a_bystander_is_not_taken_for_the_subject(
     tmp_path: Path, cameras: int, surer_in: int, stride: int, missed: slice
 ) -> None:
-    """The subject walks 13 % of his height from frame to frame, or half of it; a bystander is some metres away, or
-    nearer and surer, but in two of four cameras alone; the first camera misses the subject for three frames. Who comes
-    first in an image changes now and then."""
+    """The subject moves by 13 % of their height per frame, or by half of it. A bystander is some metres away, or nearer
+    and detected with more confidence, but by only two of four cameras. With the smaller moves, the first camera misses
+    the subject for three frames. The order of people differs between images."""
     rig, order = ring(cameras), stride * np.arange(12) % 12
     both, expected = {}, {}
     for i, camera in enumerate(rig):
@@ -111,7 +112,7 @@ def test_nobody_else_is_taken_for_the_subject(
         np.testing.assert_array_equal(chosen[name], keypoints)
 
 
-def test_one_camera_takes_the_largest_and_most_central(tmp_path: Path) -> None:
+def test_one_camera_takes_the_largest_and_most_central_person(tmp_path: Path) -> None:
     camera = ring(4)[0]
     subject = detections([camera], noise_px=1)["c0"]
     small = subject * [0.4, 0.4, 1]  # towards the upper left corner, at the same confidence
@@ -126,7 +127,7 @@ def test_test_cameras_are_never_read(tmp_path: Path) -> None:
     assert set(subject_keypoints(capture)) == {"c0", "c1", "c2"}
 
 
-def test_nobody_is_an_error(tmp_path: Path) -> None:
+def test_a_person_seen_by_only_one_camera_is_refused(tmp_path: Path) -> None:
     cameras = ring(3)
     seen = {name: k * [1, 1, name == "c0"] for name, k in detections(cameras, 1).items()}
     with pytest.raises(InputError, match="no person"):

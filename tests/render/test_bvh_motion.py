@@ -13,7 +13,7 @@ from hnerf.errors import InputError
 from hnerf.render.bvh_motion import joints_by_name, retargeted
 from hnerf.render.motion import read_motion
 
-# A T pose in centimetres, Y up, facing +Z, with legs of 80 cm: parent and offset, x to the own side for pairs.
+# A T pose in centimetres, Y up, facing +Z, with legs of 80 cm: parent and offset; x of pairs is to their side.
 _TRUNK = {
     "pelvis": ("", (0, 90, 0)),
     "spine_01": ("pelvis", (0, 10, 0)),
@@ -38,7 +38,7 @@ T_POSE = _TRUNK | {
 
 
 def t_pose(frames: int, skeleton: str = "mixamo", prefix: str = "mixamorig:") -> Bvh:
-    """Return a file that stands in its rest pose, with a skeleton's names."""
+    """Return a file whose body stands in its rest pose, with the joint names of a skeleton."""
     ours = list(T_POSE)
     names = tuple(prefix + getattr(EQUIVALENTS[name], skeleton) for name in ours)
     parents = np.array([ours.index(parent) if parent else -1 for parent, _ in T_POSE.values()])
@@ -55,7 +55,7 @@ def directions(rig: Rig, body: BodyFit, start: str, end: str) -> np.ndarray:
     return off / np.linalg.norm(off, axis=1, keepdims=True)
 
 
-def test_limbs_point_as_the_files_do(rig: Rig) -> None:
+def test_limbs_point_as_in_the_file(rig: Rig) -> None:
     """In frame 1 the left elbow turns a quarter about Y, so that the forearm points to the back, and the left hip a
     quarter about -X, so that the leg points to the front. In frame 2 the whole body turns a quarter about Y."""
     file = t_pose(3)
@@ -72,11 +72,11 @@ def test_limbs_point_as_the_files_do(rig: Rig) -> None:
     shin = directions(rig, body, "calf_R", "foot_R")
     np.testing.assert_allclose(shin, [[0, -1, 0]] * 3, atol=1e-5)
     assert body.theta[:, ~rig.free].count_nonzero() == 0
-    assert body.theta[:, rig.joint_names.index("wrist.L")].abs().max() < 1e-5  # hands go on as forearms point
+    assert body.theta[:, rig.joint_names.index("wrist.L")].abs().max() < 1e-5  # hands continue the forearms
 
 
 def test_lengths_are_scaled_by_the_legs(rig: Rig) -> None:
-    """The file walks 80 cm, its legs' length, to the left, along x."""
+    """The body in the file moves by 80 cm, the length of its legs, to the left along x."""
     file = t_pose(2)
     file.positions[1, 0, 0] += 80
     names = [exported_name(name) for name in rig.joint_names]
@@ -89,7 +89,7 @@ def test_lengths_are_scaled_by_the_legs(rig: Rig) -> None:
 @pytest.mark.parametrize(
     "turned", [Rotation.from_euler("Y", 130, degrees=True), Rotation.from_euler("X", 90, degrees=True)]
 )
-def test_a_rest_pose_may_face_any_way_and_have_z_up(turned: Rotation, rig: Rig) -> None:
+def test_a_rest_pose_may_face_any_direction_or_have_z_up(turned: Rotation, rig: Rig) -> None:
     file, axes = t_pose(1), turned.as_matrix()
     file = Bvh(file.names, file.parents, file.offsets @ axes.T, file.frame_s, file.positions @ axes.T, file.rotations)
     body = retargeted(Path("a.bvh"), file, rig)
@@ -106,8 +106,8 @@ def test_joints_are_found_by_name(skeleton: str, prefix: str) -> None:
     assert joints_by_name(Path("a.bvh"), file.names) == {name: j for j, name in enumerate(T_POSE)}
 
 
-def test_a_file_of_cmus_database_is_not_taken_for_another_skeletons() -> None:
-    """Its fingers and both its necks have names of HumanIK's, but LowerBack, Spine and Spine1 are the trunk."""
+def test_a_file_of_the_cmu_database_is_not_taken_for_another_skeleton() -> None:
+    """Its fingers and both neck joints are named like HumanIK's, but its trunk is LowerBack, Spine and Spine1."""
     sided = ("UpLeg", "Leg", "Foot", "ToeBase", "Shoulder", "Arm", "ForeArm", "Hand", "FingerBase", "HandIndex1")
     trunk = ("Hips", "LHipJoint", "RHipJoint", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head", "LThumb")
     names = (*trunk, *(side + name for side in ("Left", "Right") for name in sided))
@@ -123,7 +123,7 @@ def test_a_file_without_arms_is_refused() -> None:
         joints_by_name(Path("a.bvh"), tuple(n for n in t_pose(1).names if "Arm" not in n and "Hand" not in n))
 
 
-def test_a_rest_pose_that_lies_is_refused(rig: Rig) -> None:
+def test_a_rest_pose_that_lies_down_is_refused(rig: Rig) -> None:
     file = t_pose(1)
     lying = Bvh(file.names, file.parents, file.offsets[:, [1, 0, 2]], file.frame_s, file.positions, file.rotations)
     with pytest.raises(InputError, match="does not stand upright"):
@@ -131,20 +131,20 @@ def test_a_rest_pose_that_lies_is_refused(rig: Rig) -> None:
 
 
 def test_an_arm_without_length_is_refused(rig: Rig) -> None:
-    """It points nowhere, and could not be aligned."""
+    """It has no direction, so it could not be aligned."""
     file = t_pose(1)
     file.offsets[list(T_POSE).index("hand_R")] = 0
     with pytest.raises(InputError, match=r"a\.bvh: forearm_R and hand_R coincide at rest; export it in a T pose"):
         retargeted(Path("a.bvh"), file, rig)
 
 
-def test_a_motion_that_is_not_there_is_said_to_be_missing(tmp_path: Path) -> None:
+def test_a_missing_motion_file_is_refused(tmp_path: Path) -> None:
     for name in ("walk.bvh", "walk.npz", "ada"):
         with pytest.raises(InputError, match=rf"{name}: no such file; give a \.bvh"):
             read_motion(tmp_path / name)
 
 
-def test_motions_are_read_by_their_suffix(tmp_path: Path) -> None:
+def test_the_suffix_decides_how_a_motion_is_read(tmp_path: Path) -> None:
     write_bvh(tmp_path / "walk.BVH", t_pose(5))
     motion = read_motion(tmp_path / "walk.BVH", "1:4")
     assert (motion.body.frames, motion.fps, motion.up) == ((1, 2, 3), 30.0, "y")

@@ -29,8 +29,8 @@ from tests.asset.figure import FRAMES, bending_body, capture, column_rig
 
 
 def giant() -> BodyFit:
-    """Return a body twice as large, its joints in another order, that stands bent at x = 10 and then jumps 30 cm at x =
-    11."""
+    """Return a body twice as large, with its joints in another order, that stands bent at x = 10 and then jumps 30 cm
+    high at x = 11."""
     rig = column_rig()
     rig = dataclasses.replace(rig, vertices_m=2 * rig.vertices_m, joints_m=2 * rig.joints_m)
     extra = torch.tensor([[0.0, 0, 3]])
@@ -55,7 +55,7 @@ def in_y_up(body: BodyFit) -> BodyFit:
 
 
 @pytest.mark.parametrize("up", ["z", "y"])
-def test_another_motion_stands_where_this_body_stood(up: str) -> None:
+def test_a_retargeted_motion_is_placed_where_the_body_stood(up: str) -> None:
     own = bending_body()  # its lowest point is at 0.5 m, its root joint at x = 0.5 in the mean, and y = 2
     motion = Motion(giant() if up == "z" else in_y_up(giant()), 10.0, up)
     found = retarget(own, motion, "z")
@@ -67,7 +67,7 @@ def test_another_motion_stands_where_this_body_stood(up: str) -> None:
     assert found.rig is own.rig
 
 
-def test_joints_that_are_locked_and_posed_as_fingers_are_go_with_the_motion() -> None:
+def test_locked_joints_that_the_motion_poses_follow_it_as_fingers_do() -> None:
     own = giant()
     own.rig.free[1] = False  # the hat's, which turns by 9
     expected = torch.tensor([[[0.0, 0, 0], [0, 0, 9], [0.1, 0, 0]], [[0, 0, 0], [0, 0, 9], [0.2, 0, 0]]])
@@ -75,10 +75,10 @@ def test_joints_that_are_locked_and_posed_as_fingers_are_go_with_the_motion() ->
 
 
 @pytest.mark.parametrize("up", ["z", "y"])
-def test_a_trunk_that_pitches_leaves_the_hips_where_they_are(up: str) -> None:
-    """The hip is 1.6 m above the origin of the other's body frame, and 0.8 m above that of `own`. As the other lies
-    down by a quarter turn about x, from (0, 0, 1.6) to (0, -1.6, 0), its frame goes by (0, 1.6, 1.6), so that the hip
-    stays."""
+def test_hips_stay_in_place_while_the_trunk_pitches(up: str) -> None:
+    """The hip is 1.6 m above the origin of the other body's frame, and 0.8 m above the origin in `own`. As the other
+    lies down, a quarter turn about x takes the hip from (0, 0, 1.6) to (0, -1.6, 0); the frame moves by (0, 1.6, 1.6),
+    so that the hip stays."""
     own, other = (
         dataclasses.replace(body, rig=dataclasses.replace(body.rig, joint_names=(*body.rig.joint_names[:-1], HIPS[0])))
         for body in (bending_body(), giant())
@@ -90,14 +90,14 @@ def test_a_trunk_that_pitches_leaves_the_hips_where_they_are(up: str) -> None:
     torch.testing.assert_close(hip_m[:, :2], torch.tensor([[0.5, 2], [0.5, 2]]))
 
 
-def test_the_motion_of_the_same_body_is_as_it_was() -> None:
-    """Its lowest points are all at 0.5 m, so that floor and median are one."""
+def test_retargeting_a_motion_to_its_own_body_changes_nothing() -> None:
+    """Its lowest points are all at 0.5 m, so floor and median coincide."""
     own = bending_body()
     own.rig.joints_m[0, 2] = 0.3
     torch.testing.assert_close(retarget(own, Motion(own, 10.0, "z"), "z").root, own.root)
 
 
-def test_up_becomes_up() -> None:
+def test_the_vertical_axis_becomes_the_vertical_axis() -> None:
     y, z = torch.eye(3)[1:]
     assert torch.equal(_rotation_between_up_axes("y", "z") @ y, z)
     assert torch.equal(_rotation_between_up_axes("z", "y") @ z, y)
@@ -117,7 +117,7 @@ def test_single_frames_off_the_floor_do_not_move_a_motion() -> None:
     torch.testing.assert_close(lowest_points_m(retarget(own, Motion(other, 10.0, "z"), "z"), "z"), expected)
 
 
-def test_how_far_the_poses_of_a_long_motion_are_is_told() -> None:
+def test_progress_through_the_poses_of_a_motion_is_reported() -> None:
     heard: list[Progress] = []
     with listening(heard.append):
         lowest_points_m(bending_body(), "z")
@@ -125,7 +125,7 @@ def test_how_far_the_poses_of_a_long_motion_are_is_told() -> None:
     assert heard == [("lowest points", done, count) for done in range(count + 1)]
 
 
-def test_a_motion_without_a_joint_that_turns_is_refused() -> None:
+def test_a_motion_that_lacks_a_free_joint_is_refused() -> None:
     other = bending_body()
     other = dataclasses.replace(other, rig=dataclasses.replace(other.rig, joint_names=("root", "tail")))
     with pytest.raises(InputError, match=r"no joint upper\.L"):
@@ -148,7 +148,7 @@ def test_half_way_between_two_poses_is_half_the_turn() -> None:
     torch.testing.assert_close(found.root[[0, 2]], body.root[:2])
 
 
-def test_the_turn_between_two_poses_goes_the_short_way() -> None:
+def test_interpolation_between_two_poses_takes_the_shortest_turn() -> None:
     body = bending_body()
     body.theta[0, 1], body.theta[1, 1] = torch.tensor([0.0, 0, 3.0]), torch.tensor([0.0, 0, -3.0])
     middle = interpolate_poses(body, 3, 4, 3).theta[1, 1]
@@ -164,18 +164,18 @@ def test_frames_are_chosen_by_number(wanted: str, chosen: tuple[int, ...]) -> No
 
 
 @pytest.mark.parametrize(("wanted", "message"), [("6", "ada: no frames 6; it has 3 to 8"), ("a:b", "FIRST:END:STEP")])
-def test_frames_that_are_not_there_are_refused(wanted: str, message: str) -> None:
+def test_missing_frames_are_refused(wanted: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         select_frames((3, 4, 5, 8), wanted, Path("ada"))
 
 
-def test_rows_are_found_by_frame() -> None:
+def test_poses_are_selected_by_frame() -> None:
     body = bending_body()
     torch.testing.assert_close(select_poses(body, (5, 8)).theta, body.theta[2:])
 
 
 def test_poses_of_a_long_motion_are_selected_in_one_pass() -> None:
-    """Looking each frame up among all would compare 200 * 199 / 2 pairs of frames; here equal ones are the same."""
+    """Searching all frames for each would compare 200 * 199 / 2 pairs; a dictionary finds identical ones without."""
     compared = []
 
     class Frame(int):
@@ -203,7 +203,7 @@ def test_the_fit_of_another_subject_is_read_with_its_rate(tmp_path: Path) -> Non
     torch.testing.assert_close(motion.body.root, bending_body().root[1:3])
 
 
-def test_amass_poses_turn_the_likes_of_smpls_joints(tmp_path: Path) -> None:
+def test_amass_poses_turn_the_equivalents_of_smpls_joints(tmp_path: Path) -> None:
     poses, trans = np.zeros((3, 156)), np.array([[0, 0, 9.0], [0.5, 1, 1.2], [0.5, 1, 1.2]])
     poses[:, 0] = np.pi / 2  # SMPL's Y up to AMASS's Z up
     poses[2, 3 * 16 + 2] = -np.pi / 2  # the left arm from level to straight down
@@ -243,21 +243,21 @@ def test_the_rate_of_amass_has_two_names_and_a_default(rate: dict[str, float], f
         ({"poses": np.zeros((2, 72)), "trans": np.zeros((2, 3)), "mocap_framerate": np.ones(2)}, "frames per second"),
     ],
 )
-def test_what_is_no_motion_is_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+def test_invalid_motion_arrays_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "walk.npz", **arrays)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=f"walk.npz: .*{message}"):
         read_motion(tmp_path / "walk.npz")
 
 
-def test_a_shape_beyond_all_integers_is_no_motion(tmp_path: Path) -> None:
-    """It is declared by the header of an intact archive."""
+def test_an_impossibly_large_array_shape_is_refused(tmp_path: Path) -> None:
+    """The shape is declared by the header of an intact archive."""
     with zipfile.ZipFile(tmp_path / "walk.npz", "w") as archive, archive.open("poses.npy", "w") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**30, 156)})
     with pytest.raises(InputError, match=r"walk\.npz: not an \.npz of plain arrays"):
         read_motion(tmp_path / "walk.npz")
 
 
-def test_half_a_file_is_no_motion(tmp_path: Path) -> None:
+def test_a_truncated_motion_file_is_refused(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "walk.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
     whole = (tmp_path / "walk.npz").read_bytes()
     (tmp_path / "walk.npz").write_bytes(whole[: len(whole) // 2])
@@ -265,9 +265,7 @@ def test_half_a_file_is_no_motion(tmp_path: Path) -> None:
         read_motion(tmp_path / "walk.npz")
 
 
-def test_a_small_file_that_unpacks_to_more_than_fits_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_small_file_that_unpacks_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hnerf.render.motion.MAX_MOTION_BYTES", 10_000_000)
     with (
         zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
@@ -281,9 +279,9 @@ def test_a_small_file_that_unpacks_to_more_than_fits_is_refused(
 
 
 @pytest.mark.parametrize(("at", "value"), [(6, 1), (8, 99)])
-def test_an_archive_of_another_kind_is_no_motion(at: int, value: int, tmp_path: Path) -> None:
-    """Bytes 6 and 8 of a local file header are its flags (bit 0: encrypted) and its compression; in the directory at
-    the end they lie two further on."""
+def test_an_encrypted_or_otherwise_compressed_archive_is_refused(at: int, value: int, tmp_path: Path) -> None:
+    """Bytes 6 and 8 of a local file header are its flags (bit 0: encrypted) and its compression; in the central
+    directory, they are two bytes further on."""
     np.savez(tmp_path / "dance.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
     data = bytearray((tmp_path / "dance.npz").read_bytes())
     for signature, place in ((b"PK\x03\x04", at), (b"PK\x01\x02", at + 2)):
@@ -293,7 +291,7 @@ def test_an_archive_of_another_kind_is_no_motion(at: int, value: int, tmp_path: 
         read_motion(tmp_path / "dance.npz")
 
 
-def test_a_pipe_is_no_motion(tmp_path: Path) -> None:
+def test_a_pipe_in_place_of_a_motion_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "dance.npz")
     with pytest.raises(InputError, match=r"dance\.npz: is no regular file"):
         read_motion(tmp_path / "dance.npz")

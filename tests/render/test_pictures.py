@@ -19,7 +19,7 @@ CAMERA = ball_camera("a", 0.0)  # 0.75 m from the ball, on the x axis
 
 
 class SolidBall(BallAvatar):
-    """The ball with its depths: the ball of frame 0 is 0.65 m from the camera."""
+    """The ball, rendered with depths; in frame 0 it is 0.65 m from the camera."""
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         pixels = np.stack(np.meshgrid(np.arange(SIZE_PX), np.arange(SIZE_PX)), -1).astype(np.float64)
@@ -56,8 +56,8 @@ def test_normals_of_a_ball_point_away_from_its_middle() -> None:
     assert (image[~seen(CAMERA, centre_m(0))] == 0).all()
 
 
-def test_a_pixel_whose_centre_passes_the_person_has_no_normal() -> None:
-    """Three of its quarters are covered, so it has an alpha of .75 and, being its centre's, no depth."""
+def test_a_pixel_whose_centre_misses_the_person_has_no_depth_or_normal() -> None:
+    """Three of its quarters are covered, so its alpha is .75; the depth is that of its centre, so it has none."""
     ball = SolidBall(ball_fit())
     alpha, depth_m = torch.zeros(SIZE_PX, SIZE_PX), torch.zeros(SIZE_PX, SIZE_PX)
     alpha[28, 40] = 0.75
@@ -66,7 +66,9 @@ def test_a_pixel_whose_centre_passes_the_person_has_no_normal() -> None:
     assert not normal_image(ball, rendering, CAMERA, ball.body.theta[0], ball.body.root[0]).any()
 
 
-def test_every_kind_is_written_for_every_shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_kind_of_image_and_mesh_is_written_for_every_shot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("hnerf.avatar.surface.POSED_CELLS", 48)
     ball = SolidBall(ball_fit())
     shots = [(CAMERA, 0), (ball_camera("b", 90.0), 3)]
@@ -105,7 +107,7 @@ def test_the_surface_of_a_frame_is_extracted_once(tmp_path: Path, monkeypatch: p
     assert written[2:] == written[:2] and written[0] != written[1]
 
 
-def test_every_kind_of_image_is_a_video_too(tmp_path: Path) -> None:
+def test_every_kind_of_image_is_also_written_as_a_video(tmp_path: Path) -> None:
     write_pictures(SolidBall(ball_fit()), [(CAMERA, 0)] * 2, ("colour", "depth", "normals", "mask"), 5.0, tmp_path)
     towards_camera = (127.5, 127.5, 255)
     for kind, middle in {"colour": RENDERED, "depth": 255, "normals": towards_camera, "mask": 255}.items():
@@ -113,11 +115,11 @@ def test_every_kind_of_image_is_a_video_too(tmp_path: Path) -> None:
         assert (len(video.frames), video.fps) == (2, 5.0)
         for picture in video.read([0, 1]):
             np.testing.assert_allclose(picture.rgb[31, 31], middle, atol=16, err_msg=kind)
-            assert picture.rgb[0, 0].max() < 16  # nobody
+            assert picture.rgb[0, 0].max() < 16  # background
 
 
 @pytest.mark.parametrize("fps", [200 / 3, 29.97, 1000 / 3])
-def test_a_video_has_its_rate_as_nearly_as_the_format_can(fps: float, tmp_path: Path) -> None:
+def test_a_video_has_the_frame_rate_as_exactly_as_the_format_allows(fps: float, tmp_path: Path) -> None:
     (tmp_path / "colour").mkdir()
     for number in range(2):
         cv2.imwrite(str(tmp_path / "colour" / f"{number:06d}.png"), np.zeros((16, 16, 3), np.uint8))
@@ -125,7 +127,7 @@ def test_a_video_has_its_rate_as_nearly_as_the_format_can(fps: float, tmp_path: 
     assert Video.open(tmp_path / "colour.mp4").fps == pytest.approx(fps, rel=1e-3)
 
 
-def test_greys_of_depths_by_hand(tmp_path: Path) -> None:
+def test_grey_levels_of_depths_by_hand(tmp_path: Path) -> None:
     depths_mm = np.array([[[0, 2000], [2100, 2200]], [[0, 0], [2400, 0]], [[0, 0], [0, 0]]], np.uint16)
     for k, depth_mm in enumerate(depths_mm):
         cv2.imwrite(str(tmp_path / f"{k}.png"), depth_mm)
@@ -137,12 +139,12 @@ def test_greys_of_depths_by_hand(tmp_path: Path) -> None:
     assert third.shape == (2, 2, 3) and not third.any()
 
 
-def test_nobody_in_any_depth_image_is_a_black_video(tmp_path: Path) -> None:
+def test_depth_images_without_a_person_are_black(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((16, 16), np.uint16))
     assert not read_depth_grey(tmp_path / "0.png", depth_span_mm(tmp_path)).any()
 
 
-def test_only_what_was_asked_for_is_written(tmp_path: Path) -> None:
+def test_only_the_requested_kinds_are_written(tmp_path: Path) -> None:
     write_pictures(SolidBall(ball_fit()), [(CAMERA, 0)], ("mask",), 5.0, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mask", "mask.mp4"]
 

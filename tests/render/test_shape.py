@@ -15,8 +15,8 @@ from tests.body.two_bone import two_bone_rig
 
 
 def changeable_rig() -> Rig:
-    """Return the column with two shape values: "weight" widens it by its radius a unit, so that volume goes with (1 +
-    weight) squared; "length" stretches it away from z = 0.8 by its length a unit."""
+    """Return the column with two shape values: "weight" widens it by its radius per unit, so its volume grows with
+    (1 + weight) squared; "length" stretches it away from z = 0.8 by its length per unit."""
     rig = column_rig()
     weight = rig.vertices_m * torch.tensor([1.0, 1, 0])
     length = (rig.vertices_m - torch.tensor([0, 0, 0.8])) * torch.tensor([0.0, 0, 1])
@@ -37,8 +37,8 @@ def bone_rig(upper: str) -> Rig:
 
 
 @pytest.mark.parametrize("change", [0.44, -0.51, 0.0])
-def test_volume_changes_as_asked(change: float) -> None:
-    """Expect the radius to go with the root of the column's volume, and its ends to stay."""
+def test_volume_changes_as_requested(change: float) -> None:
+    """Expect the radius to grow with the square root of the column's volume, and its ends to stay."""
     rig = bone_rig("upper")
     found = with_volume(rig, change)
     radius = math.sqrt(1 + change)
@@ -46,7 +46,7 @@ def test_volume_changes_as_asked(change: float) -> None:
     assert volume_m3(found) == pytest.approx((1 + change) * volume_m3(rig), rel=1e-3)
 
 
-def test_head_hands_and_feet_stay_as_thick_as_they_are() -> None:
+def test_head_hands_and_feet_keep_their_thickness() -> None:
     """Expect skin of the neck's bone, above z = 0.9, to stay; below z = 0.7 all of it moves away from the axis."""
     rig = bone_rig("neck01")
     z = rig.vertices_m[:, 2]
@@ -74,7 +74,7 @@ def test_a_volume_out_of_reach_is_refused(change: float) -> None:
         with_volume(bone_rig("upper"), change)
 
 
-def test_values_are_added_by_name() -> None:
+def test_shape_values_are_added_by_name() -> None:
     rig = changeable_rig()
     found = with_shape_values(rig, {"length": 0.5})
     torch.testing.assert_close(found.beta, torch.tensor([0.3, 1.1]))
@@ -87,7 +87,7 @@ def test_a_shape_that_turns_its_skin_inside_out_is_refused() -> None:
             with_shape_values(changeable_rig(), {"weight": change})
 
 
-def test_an_unknown_value_is_refused_with_those_that_there_are() -> None:
+def test_an_unknown_shape_value_is_refused_with_a_list_of_known_ones() -> None:
     with pytest.raises(InputError, match="--shape fat: no such value; this body's are weight, length"):
         with_shape_values(changeable_rig(), {"fat": 1.0})
 
@@ -99,9 +99,9 @@ def test_another_shape_stands_on_the_same_floor() -> None:
     torch.testing.assert_close(longer.root[:, :2], body.root[:, :2])
 
 
-def test_a_trunk_that_pitches_leaves_the_hips_of_another_shape_where_they_are() -> None:
-    """The hip is 0.8 m above the origin of the body frame, of the longer body 1.2 m. A quarter turn about x takes it
-    from (0, 0, z) to (0, -z, 0): without a shift, 0.4 m further back."""
+def test_hips_of_another_shape_stay_in_place_while_the_trunk_pitches() -> None:
+    """The hip is 0.8 m above the origin of the body frame, or 1.2 m in the longer body. A quarter turn about x takes it
+    from (0, 0, z) to (0, -z, 0): without a shift, the longer body's is 0.4 m further back."""
     body, rig = bending_body(), changeable_rig()
     rig = dataclasses.replace(rig, joint_names=("root", HIPS[0]))
     rig.joint_basis[1, 1, 2] = 0.8
@@ -112,8 +112,8 @@ def test_a_trunk_that_pitches_leaves_the_hips_of_another_shape_where_they_are() 
     assert longer.root[0, 1, 3] - body.root[0, 1, 3] == pytest.approx(0.4, abs=1e-5)
 
 
-def test_what_is_beyond_the_end_of_its_bone_is_away_from_that_end() -> None:
-    """The forearm reaches from 1 m to 2 m; a vertex of it at 2.3 m is 30 cm beyond its end and 10 cm aside."""
+def test_the_offset_of_a_vertex_beyond_its_bone_is_from_the_bones_end() -> None:
+    """The forearm reaches from 1 m to 2 m; its vertex at 2.3 m is 30 cm beyond its end and 10 cm to the side."""
     rig = two_bone_rig()
     rig.vertices_m[2] = torch.tensor([0.1, 0, 2.3])
     torch.testing.assert_close(offsets_from_bones_m(rig)[2], torch.tensor([0.1, 0, 0.3], dtype=torch.float64))

@@ -37,8 +37,8 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras = capture.cameras.values()
     lenses = [Lens(c.name, c.K, np.zeros(5), c.R, c.t_m, c.size_px) for c in cameras]
     write_cameras(folder / "calibration", lenses, "easymocap")
-    in_step = {name: {"frame_offset": 0} for name in capture.cameras}
-    (folder / "calibration" / "report.json").write_text(json.dumps({"cameras": in_step}))
+    synchronised = {name: {"frame_offset": 0} for name in capture.cameras}
+    (folder / "calibration" / "report.json").write_text(json.dumps({"cameras": synchronised}))
     body.save(folder / "training")
     settings = TINY.model_copy(update={"field": TINY.field.model_copy(update={"nodes": 1})})
     field = build_field(settings.field, body, False)
@@ -51,13 +51,13 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copy(subject: Path, tmp_path: Path) -> Path:
-    """Copy the subject, to be damaged."""
+    """Return a copy of the subject, to be damaged."""
     return shutil.copytree(subject, tmp_path / "copy")
 
 
 @pytest.fixture
 def refusal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Return what renders in vain, leaves nothing behind, and returns the one line that says why."""
+    """Return a function that renders, checks that it is refused without output, and returns the one error line."""
 
     def refused(subject: Path, *options: str) -> str:
         assert main(["render", str(subject), "--out", str(tmp_path / "out"), *options]) == 2
@@ -88,9 +88,9 @@ def test_a_recorded_camera_shows_every_fitted_frame(subject: Path, tmp_path: Pat
     assert not (tmp_path / "out.partial").exists()
 
 
-def test_a_frame_alone_keeps_its_deformation_and_no_pose_between_two_has_one(subject: Path, tmp_path: Path) -> None:
-    """Displace frames 1 and 2 by 15 cm, 1.4 pixels, to either side of their poses; poses from one to the other are not
-    displaced, not even the first and the last, which would jump."""
+def test_a_recorded_frame_keeps_its_deformation_and_interpolated_poses_have_none(subject: Path, tmp_path: Path) -> None:
+    """Frames 1 and 2 are displaced by 15 cm, 1.4 pixels, to either side of their poses. Poses interpolated between them
+    are not displaced, not even the first and the last; otherwise these would jump."""
     arguments = {"alone": ["--frames", "1"], "between": ["--between", "1", "2", "--pictures", "3"]}
     for name, options in arguments.items():
         view = ["--camera", "0", "--what", "colour", *options]
@@ -114,17 +114,17 @@ def test_every_second_frame_lasts_twice_as_long(subject: Path, tmp_path: Path) -
     options = ["--camera", "0", "--what", "mask", "--frames", "::2"]
     assert main(["render", str(subject), "--out", str(tmp_path / "out"), *options]) == 0
     video = Video.open(tmp_path / "out" / "mask.mp4")
-    assert (len(video.frames), video.fps) == (2, 5.0)  # of 10 a second
+    assert (len(video.frames), video.fps) == (2, 5.0)  # recorded at 10 a second
 
 
-def test_a_size_is_that_of_the_longer_side(subject: Path) -> None:
+def test_the_size_sets_the_longer_side(subject: Path) -> None:
     capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
     wide = dataclasses.replace(capture, cameras=capture.cameras | {"2": capture.cameras["2"].resized(80, 40)})
     (found,) = _cameras(RenderOptions(camera="2", size_px=20, pictures=1), wide, body)
     assert found.size_px == (20, 10)
 
 
-def test_an_orbit_round_one_pose_has_the_size_and_number_asked_for(subject: Path, tmp_path: Path) -> None:
+def test_an_orbit_around_one_pose_has_the_requested_size_and_number_of_images(subject: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ["--frames", "1", "--pictures", "4", "--size", "48", "--what", "mask"]
     assert main(["render", str(subject), "--out", str(out), *options]) == 0
@@ -136,8 +136,8 @@ def test_an_orbit_round_one_pose_has_the_size_and_number_asked_for(subject: Path
         assert abs((y.min() + y.max()) / 2 - 23.5) < 4
 
 
-def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path: Path) -> None:
-    """Expect intrinsics of the images as recorded, not as downscaled by ingest."""
+def test_a_camera_path_without_sizes_takes_the_size_of_the_recording(subject: Path, tmp_path: Path) -> None:
+    """Intrinsics of a path are for images as recorded, not as downscaled by ingest."""
     capture = Capture.load(subject / "capture")
     lens = Lens("a", capture.cameras["2"].K, np.zeros(5), capture.cameras["2"].R, capture.cameras["2"].t_m, None)
     write_cameras(tmp_path / "path", [lens], "easymocap")
@@ -146,8 +146,8 @@ def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path:
     assert found.size_px == (500, 300)
 
 
-def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path) -> None:
-    """Expect no exposure gain, though an orbit copies the first camera and a path's cameras may have any name."""
+def test_virtual_cameras_have_no_exposure_gain(subject: Path) -> None:
+    """An orbit copies the first camera, and cameras of a path may have any name: neither may use a recorded gain."""
     capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
     assert not {camera.name for camera in _cameras(RenderOptions(), capture, body)} & set(capture.cameras)
     along_recorded = _cameras(RenderOptions(path=subject / "calibration"), capture, body)
@@ -155,20 +155,20 @@ def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path
     assert {camera.name for camera in _cameras(RenderOptions(camera="2"), capture, body)} == {"2"}
 
 
-def test_how_far_the_box_of_a_long_motion_is_is_told(subject: Path) -> None:
+def test_progress_of_computing_the_box_of_a_motion_is_reported(subject: Path) -> None:
     heard: list[Progress] = []
     with listening(heard.append):
         _cameras(RenderOptions(), Capture.load(subject / "capture"), BodyFit.load(subject / "training"))
     assert heard == [("box of the motion", done, 3) for done in range(4)]
 
 
-def test_interpolation_and_another_motion(subject: Path, tmp_path: Path) -> None:
+def test_interpolated_poses_of_another_motion_are_rendered_along_a_path(subject: Path, tmp_path: Path) -> None:
     options = ["--between", "0", "2", "--pictures", "3", "--motion", str(subject), "--path", f"{subject}/calibration"]
     assert main(["render", str(subject), "--out", str(tmp_path / "out"), "--what", "depth", *options]) == 0
     assert len(numbers(tmp_path / "out", "depth")) == 3
 
 
-def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Path) -> None:
+def test_a_taller_body_reaches_higher_in_the_image(subject: Path, tmp_path: Path) -> None:
     tops = []
     for name, options in (("as_fitted", []), ("taller", ["--shape", "height=+0.4"])):
         out = tmp_path / name
@@ -198,7 +198,7 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
         (["--volume", "-100"], "volume -100 %: cannot be reached with this body"),
     ],
 )
-def test_a_wish_that_cannot_be_met_is_one_line(
+def test_impossible_options_are_refused_in_one_line(
     options: list[str], message: str, subject: Path, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
     assert message in refusal(subject, *options)
@@ -206,18 +206,22 @@ def test_a_wish_that_cannot_be_met_is_one_line(
 
 
 @pytest.mark.parametrize("options", [["--between", "0", "1"], ["--volume", "5"], ["--shape", "height=0.1"]])
-def test_a_model_of_moments_shows_no_other(options: list[str], copy: Path, refusal: Callable[..., str]) -> None:
+def test_a_model_without_poses_shows_recorded_frames_only(
+    options: list[str], copy: Path, refusal: Callable[..., str]
+) -> None:
     stored = {"static": True, "training": load_settings("nerfies").training.model_dump()}
     (copy / "training" / "settings.json").write_text(json.dumps(stored))
     assert "copy: Nerfies has no pose to set" in refusal(copy, *options)
 
 
-def test_what_is_there_is_not_written_over(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_existing_folder_is_not_overwritten(
+    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["render", str(subject), "--out", str(tmp_path)]) == 2
     assert "exists; give the name of a new folder" in capsys.readouterr().err
 
 
-def test_a_folder_that_is_no_subject_is_refused(tmp_path: Path, refusal: Callable[..., str]) -> None:
+def test_a_folder_without_a_subject_is_refused(tmp_path: Path, refusal: Callable[..., str]) -> None:
     assert "capture.json: missing; give <store>/subjects/<name>" in refusal(tmp_path)
 
 
@@ -233,7 +237,7 @@ def test_a_folder_that_is_no_subject_is_refused(tmp_path: Path, refusal: Callabl
         ("training/model.safetensors", "training"),
     ],
 )
-def test_a_copy_with_a_file_that_is_cut_is_one_line(
+def test_a_subject_with_a_truncated_file_is_refused_in_one_line(
     file: str, named: str, copy: Path, refusal: Callable[..., str]
 ) -> None:
     (copy / file).write_bytes((copy / file).read_bytes()[: (copy / file).stat().st_size // 2])
@@ -242,7 +246,7 @@ def test_a_copy_with_a_file_that_is_cut_is_one_line(
 
 
 def _set(**changes: object) -> Callable[[Path], object]:
-    """Return what replaces keys of a subject's capture."""
+    """Return a function that replaces keys of a subject's capture."""
 
     def change(subject: Path) -> None:
         path = subject / "capture/capture.json"
@@ -252,7 +256,7 @@ def _set(**changes: object) -> Callable[[Path], object]:
 
 
 def _set_camera(**changes: object) -> Callable[[Path], object]:
-    """Return what replaces keys of camera 2 in a subject's capture."""
+    """Return a function that replaces keys of camera 2 in a subject's capture."""
 
     def change(subject: Path) -> None:
         cameras = json.loads((subject / "capture/capture.json").read_text())["cameras"]
@@ -262,7 +266,7 @@ def _set_camera(**changes: object) -> Callable[[Path], object]:
 
 
 def _replace(file: str, old: str, new: str) -> Callable[[Path], object]:
-    """Return what replaces text of a file of a subject's calibration."""
+    """Return a function that replaces text in a file of a subject's calibration."""
 
     def change(subject: Path) -> None:
         text = (subject / "calibration" / file).read_text()
@@ -296,7 +300,9 @@ NONSENSE = {
 
 
 @pytest.mark.parametrize("case", NONSENSE)
-def test_a_copy_that_parses_and_makes_no_sense_is_one_line(case: str, copy: Path, refusal: Callable[..., str]) -> None:
+def test_a_subject_with_invalid_values_is_refused_in_one_line(
+    case: str, copy: Path, refusal: Callable[..., str]
+) -> None:
     """Deep nesting overflows the stack of OpenCV's own parser."""
     damage, message = NONSENSE[case]
     damage(copy)
@@ -315,7 +321,7 @@ def test_a_copy_that_parses_and_makes_no_sense_is_one_line(case: str, copy: Path
         ("body.npz", "T", np.zeros((4, 4)), ", T (4, 4) are not "),
     ],
 )
-def test_a_copy_whose_arrays_do_not_fit_each_other_is_one_line(
+def test_a_subject_with_inconsistent_arrays_is_refused_in_one_line(
     file: str, name: str, array: np.ndarray, message: str, copy: Path, refusal: Callable[..., str]
 ) -> None:
     with np.load(copy / "training" / file) as stored:
@@ -324,7 +330,9 @@ def test_a_copy_whose_arrays_do_not_fit_each_other_is_one_line(
     assert line.startswith(f"hnerf: {copy / 'training'}: damaged, or written by another version (") and message in line
 
 
-def test_a_motion_of_another_version_is_one_line(subject: Path, copy: Path, refusal: Callable[..., str]) -> None:
+def test_a_motion_of_another_version_is_refused_in_one_line(
+    subject: Path, copy: Path, refusal: Callable[..., str]
+) -> None:
     _set(lens=1)(copy)
     line = refusal(subject, "--motion", str(copy))
     assert line.startswith(f"hnerf: {copy / 'capture/capture.json'}: damaged, or written by another version (")

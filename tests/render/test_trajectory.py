@@ -16,7 +16,7 @@ TARGET_M = np.array([1.0, 2, 1])
 
 
 def camera_at(centre_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Camera:
-    """Return a level camera that looks along +y where the yaw is zero; Z is up."""
+    """Return a level camera that looks along +y if the yaw is zero; Z is up."""
     level = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     R = level @ Rotation.from_euler("z", -yaw_deg, degrees=True).as_matrix()
     K = np.array([[500.0, 0, 90], [0, 400, 50], [0, 0, 1]])
@@ -28,7 +28,7 @@ def plain(camera: Camera) -> dict[str, object]:
     return {"K": camera.K.tolist(), "R": camera.R.tolist(), "t_m": camera.t_m.tolist(), "size_px": size_px}
 
 
-def test_an_orbit_goes_round_its_target_at_its_radius_and_looks_at_it() -> None:
+def test_an_orbit_circles_its_target_at_the_given_radius_and_looks_at_it() -> None:
     found = orbit([camera_at((4, 2, 5))], TARGET_M, 4, "z", radius_m=2, height_m=0.5)
     expected_m = [[3, 2, 1.5], [1, 4, 1.5], [-1, 2, 1.5], [1, 0, 1.5]]  # from +x, where the first camera is, to +y
     np.testing.assert_allclose([c.centre_m for c in found], expected_m, atol=1e-9)
@@ -44,7 +44,7 @@ def test_an_orbit_is_by_default_as_far_and_high_as_the_cameras() -> None:
     np.testing.assert_allclose(first.centre_m, [3, 2, 3])  # 3 and 1 m away, 1 and 3 m up
 
 
-def test_an_orbit_where_y_is_up_is_level_in_x_and_z() -> None:
+def test_an_orbit_with_y_up_is_level_in_x_and_z() -> None:
     found = orbit([camera_at((1, 2, 4))], TARGET_M, 2, "y", height_m=1.0)
     np.testing.assert_allclose([c.centre_m for c in found], [[1, 3, 4], [1, 3, -2]], atol=1e-9)
 
@@ -55,7 +55,7 @@ def test_an_orbit_that_is_no_circle_is_refused(radius_m: float, height_m: float)
         orbit([camera_at((4, 2, 5))], TARGET_M, 4, "z", radius_m, height_m)
 
 
-def test_a_path_passes_its_cameras_and_halves_the_turn_between_two() -> None:
+def test_a_path_passes_through_its_cameras_and_interpolates_between_them() -> None:
     first, last = camera_at((0, 0, 1)), camera_at((2, 4, 3), yaw_deg=90)
     last = dataclasses.replace(last, K=last.K * [[2, 1, 1], [1, 1, 1], [1, 1, 1]])
     start, middle, end = interpolate_cameras([first, last], 3)
@@ -98,7 +98,7 @@ def test_a_path_is_read_from_a_folder_of_cameras_in_its_own_unit(tmp_path: Path)
         ([plain(camera_at((0, 0, 1))), plain(camera_at((0, 0, 1))) | {"size_px": [1, 1]}], "2 image sizes"),
     ],
 )
-def test_what_is_no_path_is_refused(content: object, message: str, tmp_path: Path) -> None:
+def test_invalid_camera_paths_are_refused(content: object, message: str, tmp_path: Path) -> None:
     (tmp_path / "path.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=f"path.json.*{message}"):
         read_camera_path(tmp_path / "path.json", (1, 1))

@@ -52,7 +52,7 @@ def write_scene(
 
 
 def write_likely(capture: Capture, masks: dict) -> None:
-    """What a network would say of each pixel, blurred by 2 px, and of a poster in a corner."""
+    """Write person probabilities as from a network: the masks, blurred by 2 px, and a poster in a corner."""
     for (camera, frame), mask in masks.items():
         likely = cv2.GaussianBlur(np.where(mask, 255.0, 0.0), (0, 0), 2)
         likely[:40, :30] = 255
@@ -81,13 +81,13 @@ def _mirrored(mask: np.ndarray) -> np.ndarray:
 
 
 def write_masks(capture: Capture, masks: dict) -> None:
-    """Write given masks beside the images."""
+    """Write given masks next to the images."""
     for (camera, frame), mask in masks.items():
         write_image(capture.root / "masks" / camera / f"{frame:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
 
 
 def only_frames(capture: Capture, count: int) -> Capture:
-    """Keep the first frames; the others lose their keypoints in the folder, too."""
+    """Keep the first frames only, and remove the keypoints of the others from the folder, too."""
     with edited_keypoints(capture.root) as found:
         found |= {name: seen[:count] for name, seen in found.items()}
     return dataclasses.replace(capture, train_frames=tuple(range(count)), novel_pose_frames=())

@@ -1,4 +1,4 @@
-"""Use of dropped masks by the stages after segmentation."""
+"""How stages after segmentation treat views whose masks were dropped."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from tests.training.scene import record
 ALONE = Distributed(0, 1, torch.device("cpu"))
 
 
-def test_fit_and_training_do_without(tmp_path: Path) -> None:
+def test_fit_and_training_do_without_dropped_masks(tmp_path: Path) -> None:
     capture, whole, body = record(tmp_path)
     masks = Masks({view: png for view, png in whole.encoded.items() if view != ("1", 0) and view[1] != 1}, {})
 

@@ -6,8 +6,8 @@ import pytest
 from hnerf.segmentation.edge import shaded_plate
 
 
-def test_the_plate_at_an_edge_is_as_dark_as_the_image_beside_it():
-    """A bright person on the left of a plate of 100; the ground on the right lies in a shadow of 50."""
+def test_the_plate_at_an_edge_is_as_dark_as_the_image_next_to_it():
+    """A bright person covers the left of a plate of level 100; the right lies in a shadow of level 50."""
     plate = np.full((40, 60, 3), 100, np.uint8)
     mask = np.zeros((40, 60), bool)
     mask[:, :30] = True
@@ -25,9 +25,9 @@ def test_an_unshaded_plate_stays_as_it_is():
     assert shaded_plate(mask, image, plate) == pytest.approx(plate.astype(float), abs=0.01)
 
 
-def test_a_mask_that_ends_within_the_person_shades_nothing():
-    """A grey person stands before a varied wall. Where the mask is 4 px too small, the person is just outside it, at a
-    brightness to which no shadow takes the wall; with the right mask the wall is."""
+def test_a_mask_that_ends_within_the_person_leaves_the_plate_unshaded():
+    """A grey person stands in front of a varied wall in shadow. If the mask is 4 px too small, the person is just
+    outside it, with a brightness that no shadow on the wall explains. With the right mask, the wall is just outside."""
     plate = np.random.default_rng(0).integers(20, 256, (60, 60, 1)).astype(np.uint8).repeat(3, -1)
     person, small = np.zeros((2, 60, 60), bool)
     person[10:50, 10:50], small[14:46, 14:46] = True, True

@@ -1,4 +1,4 @@
-"""Learned segmentation with a network made here: the person's probability is a step where blue is 0.3 above red."""
+"""Learned segmentation, with a network made here: the probability of a person steps up where blue - red is 0.3."""
 
 import sys
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.segmentation.scene import PERSON_RGB, write_scene
 
 
 def write_network(path: Path, shape: list, gain: float = 50.0) -> Path:
-    """Write sigmoid(gain * (blue - red - 0.3)) as a convolution of 1 x 1; channels last where `shape` says so."""
+    """Write sigmoid(gain * (blue - red - 0.3)) as a 1 x 1 convolution; channels come last if `shape` says so."""
     first = shape[1] == 3
     names = ["image", "planes"] if first else ["turned", "planes"]
     weights = helper.make_tensor("weights", TensorProto.FLOAT, [1, 3, 1, 1], [-gain, 0.0, gain])
@@ -29,7 +29,7 @@ def write_network(path: Path, shape: list, gain: float = 50.0) -> Path:
 
 
 def save(path: Path, shape: list, nodes: list[NodeProto], *constants: TensorProto) -> Path:
-    """Write a network from `image`, of this shape, to `person`."""
+    """Write a network with the input `image`, of this shape, and the output `person`."""
     image, seen = (
         helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in (("image", shape), ("person", None))
     )
@@ -49,7 +49,7 @@ def test_probability_by_hand(tmp_path: Path, shape: list) -> None:
     np.testing.assert_allclose(found[:, :8], 0, atol=1e-6)
 
 
-def test_the_subject_among_what_the_network_finds(tmp_path: Path) -> None:
+def test_the_subject_is_chosen_among_the_people_that_the_network_finds(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path, plate=False, stranger_px=130)
     settings = SegmentationSettings(model=write_network(tmp_path / "n.onnx", [1, 3, "H", "W"]))
     masks = segment(capture, None, settings)
@@ -69,7 +69,7 @@ def test_a_missing_file_and_a_missing_package_say_what_to_do(tmp_path: Path, mon
         Network(path)
 
 
-def test_files_that_are_no_such_network(tmp_path: Path) -> None:
+def test_files_without_a_usable_network_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("not a network")
     with pytest.raises(InputError, match="not a network that ONNX Runtime can run"):
         Network(tmp_path / "text.onnx")
@@ -80,15 +80,15 @@ def test_files_that_are_no_such_network(tmp_path: Path) -> None:
         Network(flat)
 
 
-def test_a_network_whose_output_is_no_number_is_refused(tmp_path: Path) -> None:
-    """A NaN is neither below 0 nor above 1."""
+def test_a_network_whose_output_is_nan_is_refused(tmp_path: Path) -> None:
+    """NaN is neither below 0 nor above 1, so a range check alone would miss it."""
     path = write_network(tmp_path / "n.onnx", [1, 3, "H", "W"], gain=float("nan"))
     with pytest.raises(InputError, match=r"n\.onnx: its first output must be one map of probabilities; it is .* nan"):
         Network(path).probability(np.zeros((10, 20, 3), np.uint8))
 
 
-def test_a_network_that_loads_but_does_not_run(tmp_path: Path) -> None:
-    """The network accepts any height and width, but then needs 4 x 4 pixels."""
+def test_a_network_that_loads_but_does_not_run_is_refused(tmp_path: Path) -> None:
+    """The network declares any height and width, but runs on 4 x 4 pixels only."""
     size = helper.make_tensor("size", TensorProto.INT64, [4], [1, 3, 4, 4])
     node = helper.make_node("Reshape", ["image", "size"], ["person"])
     fixed = Network(save(tmp_path / "fixed.onnx", [1, 3, "H", "W"], [node], size))

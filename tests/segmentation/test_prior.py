@@ -25,7 +25,9 @@ HIPS = [8, 9, 12]
     [(2, HEAD, 0), (2, HEAD, 1), (1, HEAD, 0), (1, LEGS, 0), (2, FEET, 0), (1, HIPS, 0)],
     ids=["head by one camera of two", "head later on", "head by the only camera", "legs", "feet", "hips"],
 )
-def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, unseen: list[int], after: int) -> None:
+def test_body_parts_without_keypoints_are_within_reach(
+    tmp_path: Path, cameras: int, unseen: list[int], after: int
+) -> None:
     capture, truth = write_scene(tmp_path, cameras, moves_m=2.0)
     with edited_keypoints(tmp_path) as found:
         found["c0"][after:, :, unseen] = 0
@@ -36,9 +38,9 @@ def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, un
         assert priors[camera](frame).reach[person].all()
 
 
-def test_a_networks_mask_says_where_the_subject_is(tmp_path: Path) -> None:
-    """Its body is what is likelier than not of him, not of the poster; its core is surely his; where the network missed
-    him the stick figure speaks."""
+def test_a_networks_mask_locates_the_subject(tmp_path: Path) -> None:
+    """The prior's body is where the subject, not the poster, is more likely than not; its core is surely the subject.
+    If the network missed the subject, the stick figure is used."""
     capture, truth = write_scene(tmp_path, 2)
     sticks = dict(camera_priors(capture, None, SegmentationSettings()))
     write_likely(capture, truth | {("c0", 3): np.zeros_like(truth["c0", 3])})
@@ -49,12 +51,12 @@ def test_a_networks_mask_says_where_the_subject_is(tmp_path: Path) -> None:
             assert np.array_equal(prior.body, sticks[camera](frame).body)
             continue
         assert (prior.body & person).sum() / (prior.body | person).sum() > 0.9
-        assert (prior.core & ~person).sum() < 0.001 * person.sum() < prior.core.sum() / 200  # a hole that the blur shut
+        assert (prior.core & ~person).sum() < 0.001 * person.sum() < prior.core.sum() / 200  # the blur closed a hole
         assert not prior.reach[:40, :30].any()
         assert prior.reach.sum() < 0.8 * sticks[camera](frame).reach.sum()
 
 
-def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_path: Path) -> None:
+def test_a_detection_far_outside_the_image_is_drawn_at_a_limited_distance(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path, 1)
     with edited_keypoints(tmp_path) as found:
         found["c0"][0, 0, 4, :2] = 1e7, -1e9
@@ -63,9 +65,9 @@ def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_pat
     assert prior.reach[truth["c0", 0]].all()
 
 
-def test_nobody_is_where_a_camera_looks_away(tmp_path: Path) -> None:
-    """Two of three cameras see the person, who stands behind the third, and is not drawn mirrored there. A mask that is
-    given there shows somebody else."""
+def test_a_camera_that_looks_away_from_the_person_sees_nobody(tmp_path: Path) -> None:
+    """Two of three cameras see the person, who stands behind the third and must not be drawn mirrored in its image. A
+    mask given there shows somebody else."""
     cameras = ring(3)
     seen = detections(cameras, 0.5)
     seen["c2"][..., 2] = 0
@@ -82,8 +84,8 @@ def test_nobody_is_where_a_camera_looks_away(tmp_path: Path) -> None:
     assert prior.elsewhere and not Given(capture, "c2").mask(0, prior).any()
 
 
-def test_head_and_legs_in_line_with_the_trunk_by_hand() -> None:
-    # Neck at (50, 20), mid-hip at (50, 40), the left knee seen off that line; nothing else is.
+def test_unseen_head_and_legs_are_put_in_line_with_the_trunk_by_hand() -> None:
+    # Neck at (50, 20), mid-hip at (50, 40), the left knee seen off that line; nothing else is seen.
     pose_px = np.full((25, 2), np.nan)
     pose_px[1], pose_px[8], pose_px[12], pose_px[13] = (50, 20), (50, 40), (52, 40), (60, 50)
     likely = _completed_pose(pose_px)
@@ -93,12 +95,12 @@ def test_head_and_legs_in_line_with_the_trunk_by_hand() -> None:
     assert likely[14].tolist() == [68, 60]  # as far again as from hip to knee
     assert np.isnan(likely[4]).all()
     pose_px[2] = 45, 20
-    assert _completed_pose(pose_px)[9].tolist() == [46, 40]  # 0.8 of the shoulder's 5 px beside the mid-hip
+    assert _completed_pose(pose_px)[9].tolist() == [46, 40]  # 0.8 of the shoulder's 5 px to the side of the mid-hip
     pose_px[[17, 18]] = (46, 12), (48, 14)
-    assert _completed_pose(pose_px)[0].tolist() == [47, 13]  # between what is seen of the face
+    assert _completed_pose(pose_px)[0].tolist() == [47, 13]  # between the points seen of the face
 
 
-def test_hips_in_line_with_the_head_by_hand() -> None:
+def test_unseen_hips_are_put_in_line_with_the_head_by_hand() -> None:
     """The nose is 9 px above the neck at (50, 20): the mid-hip is 9 / 0.45 = 20 px below it."""
     pose_px = np.full((25, 2), np.nan)
     pose_px[0], pose_px[1], pose_px[2], pose_px[5] = (50, 11), (50, 20), (45, 20), (55, 20)
@@ -107,7 +109,7 @@ def test_hips_in_line_with_the_head_by_hand() -> None:
     assert likely[10] == pytest.approx([46, 56])
 
 
-def test_gaps_move_with_the_mid_hip_by_hand() -> None:
+def test_unseen_keypoints_move_with_the_mid_hip_by_hand() -> None:
     # The mid-hip walks 10 px a frame; the nose is seen 50 px above it at first and not again.
     tracks = np.full((3, 25, 2), np.nan)
     tracks[:, 8] = [[0, 100], [10, 100], [20, 100]]
@@ -118,7 +120,7 @@ def test_gaps_move_with_the_mid_hip_by_hand() -> None:
     assert _interpolated(tracks, (3, 4, 5))[:, 0].tolist() == [[0, 50]] * 3
 
 
-def test_gaps_are_filled_in_time_where_frames_are_missing_by_hand() -> None:
+def test_gaps_are_filled_by_frame_number_by_hand() -> None:
     # The mid-hip walks 10 px a frame, and is not seen in frame 6, after which the next frame is 15.
     tracks = np.full((4, 25, 2), np.nan)
     tracks[[0, 1, 3], 8] = [[0, 100], [10, 100], [110, 100]]

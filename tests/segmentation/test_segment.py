@@ -30,7 +30,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_a_shadow_is_not_the_person_by_hand() -> None:
-    # Left: the plate at 60 % brightness in all channels (a shadow); right: another colour of like brightness.
+    # Left: the plate at 60 % brightness in all channels (a shadow); right: another colour of similar brightness.
     plate = np.full((40, 80, 3), (150, 120, 90), np.uint8)
     image = plate.copy()
     image[10:30, 10:30] = (90, 72, 54)
@@ -42,9 +42,9 @@ def test_a_shadow_is_not_the_person_by_hand() -> None:
     assert (found.contrast[:8] == 128).all()
 
 
-@pytest.mark.parametrize("tint", [(0, 0, 0), (-2, 0, -3)], ids=["grey", "grey as a video's decoder has it"])
-def test_in_grey_pictures_a_dark_person_may_be_one_or_a_shadow(tint: tuple[int, ...]) -> None:
-    """Left: the plate at 60 % brightness, by which a shadow is e^1 times likelier or less likely than a person; right:
+@pytest.mark.parametrize("tint", [(0, 0, 0), (-2, 0, -3)], ids=["grey", "grey with the tint of a video's decoder"])
+def test_in_grey_images_a_dark_region_may_be_a_person_or_a_shadow(tint: tuple[int, ...]) -> None:
+    """Left: the plate at 60 % brightness, where a person is at most e^1 times more or less likely than a shadow; right:
     darker than any shadow."""
     plate = np.full((40, 80, 3), 150, np.uint8)
     image = plate.copy()
@@ -56,9 +56,9 @@ def test_in_grey_pictures_a_dark_person_may_be_one_or_a_shadow(tint: tuple[int, 
     assert (found.log_odds[:8] < -4).all()
 
 
-def test_noise_and_exposure_are_those_of_the_background_by_hand() -> None:
-    """Two thirds of the image are the person's. Beside him the plate is 20 % darker, but for a step of 2 levels up and
-    down, once LOG_OFFSET is added to either: 150 + 6 against 124 + 6, give or take 2."""
+def test_noise_and_exposure_are_measured_on_the_background_by_hand() -> None:
+    """The person covers two thirds of the image. Elsewhere the image is 20 % brighter than the plate, once LOG_OFFSET
+    is added to both: 150 + 6 against 124 + 6, with noise of 2 levels up and down."""
     plate, image = np.full((8, 30, 3), 124, np.uint8), np.full((8, 30, 3), 150, np.uint8)
     image[:, :20] = 30
     image[::2, 20:] += 2
@@ -71,10 +71,10 @@ def test_noise_and_exposure_are_those_of_the_background_by_hand() -> None:
     assert np.unique(bright).tolist() == [150]
     assert noise_level(image, bright, free) == pytest.approx(1.4826 * 2 + 0.5)
     assert exposure_corrected(image, image, free) is image
-    assert noise_level(image, bright, body) == pytest.approx(1.4826 * 120 + 0.5)  # most is free: all of it, 150 and 30
+    assert noise_level(image, bright, body) == pytest.approx(1.4826 * 120 + 0.5)  # on the person: 150 against 30
 
 
-def test_background_is_looked_for_ever_nearer_to_the_person() -> None:
+def test_background_is_taken_nearer_to_the_person_if_too_little_is_visible() -> None:
     wide, narrow = np.ones((10, 10), bool), np.zeros((10, 10), bool)
     narrow[2:] = True
     known = np.ones_like(wide)
@@ -84,7 +84,7 @@ def test_background_is_looked_for_ever_nearer_to_the_person() -> None:
     assert exposure_corrected(np.zeros((10, 10, 3), np.uint8), np.ones((10, 10, 3), np.uint8), ~wide).max() == 0
 
 
-def test_only_a_median_may_hold_shadows_itself() -> None:
+def test_only_a_median_plate_may_itself_contain_shadows() -> None:
     # The image is 1 / 0.6 as bright as the plate, in all channels.
     plate = np.full((8, 8, 3), (90, 72, 54), np.uint8)
     image = np.full((8, 8, 3), (150, 120, 90), np.uint8)
@@ -93,8 +93,8 @@ def test_only_a_median_may_hold_shadows_itself() -> None:
 
 
 def test_masked_median_by_hand() -> None:
-    # The pixel's values over five frames; hidden by the person (200) in three: the median of 10 and 30 is their upper.
-    # The second pixel is never free: it is painted in from the first.
+    # The first pixel's values over five frames; the person (200) hides it in three. The median of 10 and 30 is the
+    # upper one. The second pixel is never free, and is inpainted from the first.
     values, hidden = [10, 200, 200, 30, 200], [False, True, True, False, True]
     images = [np.full((1, 2, 3), value, np.uint8) for value in values]
     priors = []
@@ -106,9 +106,9 @@ def test_masked_median_by_hand() -> None:
     assert known.tolist() == [[True, False]]
 
 
-def test_an_edge_pixel_is_whose_it_shows_more_of() -> None:
-    # A bright person from column 10 on; column 9 mixes: 60 % person in the upper half, 40 % in the lower. The mask to
-    # begin with is a pixel too wide above and too narrow below.
+def test_an_edge_pixel_goes_to_the_side_that_covers_more_of_it() -> None:
+    # A bright person from column 10 on; column 9 mixes: 60 % person in the upper half, 40 % in the lower. The
+    # initial mask is a pixel too wide in the upper half, and right in the lower.
     plate, image = np.full((40, 20, 3), 50, np.uint8), np.full((40, 20, 3), 50, np.uint8)
     image[:, 10:] = 200
     image[:20, 9], image[20:, 9] = 140, 110
@@ -128,7 +128,7 @@ def test_movement_by_hand() -> None:
     assert movement_px(masks, Masks({("a", 1): encode(half(3))}, {})) == np.inf  # no view in common
 
 
-def test_components_of_another_person_go() -> None:
+def test_components_of_another_person_are_removed() -> None:
     mask = np.zeros((10, 20), bool)
     mask[2:8, 2:6] = True  # 24 px, wholly within reach
     mask[2:8, 12:18] = True  # 36 px, 6 of them within reach
@@ -139,7 +139,7 @@ def test_components_of_another_person_go() -> None:
     assert kept[2:8, 2:6].all()
 
 
-def test_clean_plate_with_a_soft_shadow(tmp_path: Path) -> None:
+def test_segmentation_with_a_clean_plate_ignores_a_soft_shadow(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path / "in")
     masks = segment(capture, None, SETTINGS)
     assert min(iou(masks.get(*view), mask) for view, mask in truth.items()) >= 0.97
@@ -153,7 +153,7 @@ def test_clean_plate_with_a_soft_shadow(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.get("c0", 3), masks.get("c0", 3))
 
 
-def test_masks_made_side_by_side_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masks_made_in_parallel_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = only_frames(write_scene(tmp_path)[0], 3)
     encoded = {}
     for threads in (1, 3):
@@ -162,7 +162,7 @@ def test_masks_made_side_by_side_are_the_same(tmp_path: Path, monkeypatch: pytes
     assert encoded[1] == encoded[3]
 
 
-def test_given_masks_come_first_and_lose_other_people(tmp_path: Path) -> None:
+def test_given_masks_take_precedence_and_lose_other_people(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path)
     given = {view: mask.copy() for view, mask in truth.items()}
     for mask in given.values():
@@ -174,8 +174,8 @@ def test_given_masks_come_first_and_lose_other_people(tmp_path: Path) -> None:
         np.testing.assert_array_equal(masks.get(*view), mask)
 
 
-def test_a_given_mask_of_somebody_else_is_no_mask_of_the_subject(tmp_path: Path) -> None:
-    """The subject is known to be outside the image; where nothing is known of the subject, the mask is believed."""
+def test_a_given_mask_of_somebody_else_is_not_used(tmp_path: Path) -> None:
+    """If the subject is known to be outside the image, the mask is emptied; if nothing is known, it is kept."""
     capture, truth = write_scene(tmp_path)
     write_masks(capture, truth)
     nowhere = np.zeros_like(truth["c0", 0])
@@ -184,7 +184,7 @@ def test_a_given_mask_of_somebody_else_is_no_mask_of_the_subject(tmp_path: Path)
         assert mask.any() == believed
 
 
-def test_of_a_mask_that_shows_but_the_subjects_feet_the_bystander_is_removed(tmp_path: Path) -> None:
+def test_a_bystander_is_removed_from_a_mask_that_shows_only_the_subjects_feet(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path)
     core, reach = np.zeros((2, *truth["c0", 0].shape), bool)
     core[4:20, 10:14], reach[2:28, 8:16] = True, True
@@ -196,7 +196,7 @@ def test_of_a_mask_that_shows_but_the_subjects_feet_the_bystander_is_removed(tmp
 
 
 def inverted_around_a_gap(mask: np.ndarray) -> np.ndarray:
-    """Return a mask of the background, of which a few pixels lie between an arm and the trunk of the person."""
+    """Return a mask of the background, including a pixel as between an arm and the trunk of the person."""
     near, nearer = (cv2.dilate(mask.astype(np.uint8), np.ones((side, side))).astype(bool) for side in (11, 9))
     beside = np.argwhere(nearer & ~mask)
     inverted = ~near
@@ -212,7 +212,7 @@ def inverted_around_a_gap(mask: np.ndarray) -> np.ndarray:
         (inverted_around_a_gap, "the mask is inverted"),
     ],
 )
-def test_a_bad_mask_is_dropped_and_named(tmp_path: Path, spoil, word: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_bad_mask_is_dropped_and_reported(tmp_path: Path, spoil, word: str) -> None:  # type: ignore[no-untyped-def]
     capture, truth = write_scene(tmp_path)
     write_masks(capture, truth | {("c0", 5): spoil(truth["c0", 5])})
     masks = segment(capture, None, SETTINGS)
@@ -229,7 +229,7 @@ def test_a_camera_without_a_good_mask_is_an_error(tmp_path: Path) -> None:
         segment(capture, None, SETTINGS)
 
 
-def test_another_person_beside_the_subject_goes(tmp_path: Path) -> None:
+def test_another_person_next_to_the_subject_is_removed(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path, stranger_px=130)
     capture = only_frames(capture, 3)
     masks = segment(capture, None, SETTINGS)
@@ -237,7 +237,7 @@ def test_another_person_beside_the_subject_goes(tmp_path: Path) -> None:
     assert min(iou(masks.get(*view), truth[view]) for view in views) >= 0.97
 
 
-def test_a_reflection_in_the_floor_goes(tmp_path: Path) -> None:
+def test_a_reflection_in_the_floor_is_removed(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path, glossy=True)
     capture = only_frames(capture, 3)
     masks = segment(capture, None, SETTINGS)
@@ -263,7 +263,7 @@ def test_a_plate_that_shows_the_person_is_an_error(tmp_path: Path) -> None:
         segment(only_frames(capture, 1), None, SETTINGS)
 
 
-def test_neither_masks_nor_plate_asks_for_a_body(tmp_path: Path) -> None:
+def test_without_masks_or_a_plate_a_fitted_body_is_required(tmp_path: Path) -> None:
     capture, _ = write_scene(tmp_path, plate=False)
     with pytest.raises(InputError, match="fit a body first"):
         segment(capture, None, SETTINGS)
@@ -272,10 +272,10 @@ def test_neither_masks_nor_plate_asks_for_a_body(tmp_path: Path) -> None:
 def test_without_a_plate_the_background_is_found_around_the_body(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path, cameras=2, plate=False, moves_m=2.0)
     nowhere_m = torch.tensor([[[0.0, 0, -9], [0.01, 0, -9], [0, 0.01, -9]]]).expand(len(capture.frames), 3, 3)
-    lost = SimpleNamespace(  # a fit that went astray: the keypoints have to do
+    failed_fit = SimpleNamespace(  # keypoints must suffice
         vertices_m=lambda: nowhere_m, rig=SimpleNamespace(faces=torch.tensor([[0, 1, 2]])), index=capture.frames.index
     )
-    masks = segment(capture, lost, SETTINGS)  # type: ignore[arg-type]
+    masks = segment(capture, failed_fit, SETTINGS)  # type: ignore[arg-type]
     assert np.mean([iou(masks.get(*view), mask) for view, mask in truth.items()]) >= 0.95
 
 

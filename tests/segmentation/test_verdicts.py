@@ -9,11 +9,11 @@ BODY[4:16, 8:12] = True  # 48 px
 PRIOR = Prior(BODY, BODY, BODY, BODY, 12.0)
 
 
-def test_a_good_mask() -> None:
+def test_a_good_mask_has_no_fault() -> None:
     assert judge_mask(BODY, PRIOR) == MaskVerdict(None, None, 48)
 
 
-def test_empty_inverted_and_astray() -> None:
+def test_empty_inverted_and_misplaced_masks_are_faulty() -> None:
     speck = np.zeros_like(BODY)
     speck[8, 8:12] = True  # 4 px, less than a tenth of 48
     assert "no person" in str(judge_mask(speck, PRIOR).fault)
@@ -21,20 +21,20 @@ def test_empty_inverted_and_astray() -> None:
     assert "misses the person" in str(judge_mask(np.roll(BODY, 5, axis=1), PRIOR).fault)
 
 
-def test_a_mask_of_something_else_too() -> None:
-    """A person can be within 48 of 400 px; in a mask of twice as many pixels as his, just half are within."""
+def test_a_mask_of_mostly_something_else_is_faulty() -> None:
+    """The person can be within 48 of 400 px. A mask of twice as many pixels is accepted: just half are within."""
     assert "mostly not the person" in str(judge_mask(np.ones_like(BODY), PRIOR).fault)
     wide = BODY.copy()
     wide[4:16, 12:16] = True
     assert judge_mask(wide, PRIOR).fault is None
 
 
-def test_inverted_without_a_prior() -> None:
+def test_an_inverted_mask_is_found_without_a_prior() -> None:
     nothing = np.zeros_like(BODY)
     assert "inverted" in str(judge_mask(~BODY, Prior(nothing, nothing, nothing, nothing, 0.0)).fault)
 
 
-def test_cut_off_by_the_border_is_noted_only() -> None:
+def test_a_mask_cut_off_by_the_border_is_only_noted() -> None:
     mask = BODY.copy()
     mask[4:, 8:12] = True
     verdict = judge_mask(mask, PRIOR)
@@ -43,7 +43,7 @@ def test_cut_off_by_the_border_is_noted_only() -> None:
 
 
 @pytest.mark.parametrize("stride", [1, 3, 10])
-def test_jumps_need_both_neighbours_and_prior(stride: int) -> None:
+def test_an_area_jump_must_contradict_both_neighbours_and_prior(stride: int) -> None:
     # The third frame leaks to twice its area; the seventh is twice as large because the person is; the last has no
     # neighbours.
     frames = tuple(stride * frame for frame in (0, 1, 2, 3, 4, 5, 6, 7, 8, 20))
@@ -53,7 +53,7 @@ def test_jumps_need_both_neighbours_and_prior(stride: int) -> None:
     assert found == {2 * stride: "area jumps from 100 to 200 px"}
 
 
-def test_a_mask_is_compared_with_near_frames_alone() -> None:
+def test_a_mask_is_compared_with_near_frames_only() -> None:
     looked_at = list[object]()
 
     class Frames(tuple[int, ...]):

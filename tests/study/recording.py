@@ -19,8 +19,8 @@ ROTATIONS = {
 
 
 def write_recording(folder: Path) -> Capture:
-    """Write images of value 100 + frame, plates of 50, masks of the middle 8 x 8 px; keypoint 1 at (frame, 5),
-    confident, the others in the image's middle. Cameras 01 and 02 train."""
+    """Write images of value 100 + frame, plates of 50, and masks of the middle 8 x 8 px. Keypoint 1 is at (frame, 5),
+    the others are in the image's middle, with confidence 1. Cameras 01 and 02 are for training."""
     sizes = dict.fromkeys(ROTATIONS, (SIZE_PX, SIZE_PX))
     cameras = {name: Camera(name, K, R, np.array([0.0, 1, 4]), SIZE_PX, SIZE_PX) for name, R in ROTATIONS.items()}
     capture = Capture("ada", folder, cameras, ("01", "02"), ("03",), FRAMES[:3], FRAMES[3:], 10.0, "z", sizes, sizes)
@@ -40,9 +40,9 @@ def write_recording(folder: Path) -> Capture:
 
 
 def write_detected(capture: Capture) -> None:
-    """Write what networks detect in the training cameras: in every frame a person mask of 200 in the middle 8 x 8 px
-    and frame elsewhere, landmarks, and two hands whose points are all at (frame, 5), but the first of the left one at
-    (7.5, 7.5)."""
+    """Write detections of networks in the training cameras. In every frame these are a person mask of 200 in the middle
+    8 x 8 px and of the frame's number elsewhere; landmarks; and two hands, whose points are all at (frame, 5), except
+    the first of the left hand, at (7.5, 7.5)."""
     likely = {frame: np.full((SIZE_PX, SIZE_PX), frame, np.uint8) for frame in capture.frames}
     hands = np.ones((len(capture.frames), 2, 21, 3))
     hands[..., 0], hands[..., 1] = np.array(capture.frames)[:, None, None], 5
@@ -56,8 +56,8 @@ def write_detected(capture: Capture) -> None:
 
 
 def write_landmarks(capture: Capture, camera: str) -> None:
-    """Write the landmarks of one person: all at x = frame, y = 5 px with confidence 1, and frame / 10 metres off in x,
-    y and z."""
+    """Write the landmarks of one person: all at x = frame, y = 5 px with confidence 1, and frame / 10 metres in x, y
+    and z."""
     frame = np.array(capture.frames)[:, None, None]
     points = np.stack(np.broadcast_arrays(frame, 5, 1), -1) * np.ones((1, 1, 33, 1))
     (capture.root / LANDMARKS).mkdir(exist_ok=True)

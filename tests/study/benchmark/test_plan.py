@@ -1,4 +1,4 @@
-"""Studies as files, and the parts of a capture that their variants name."""
+"""Study files, and the parts of a capture that their variants select."""
 
 import re
 from pathlib import Path
@@ -20,7 +20,7 @@ def write(folder: Path, text: str) -> str:
     return str(folder / "study.yaml")
 
 
-def test_studies_that_are_promised_are_there_and_valid() -> None:
+def test_the_expected_studies_exist_and_are_valid() -> None:
     studies = {path.stem: load_study(path.stem) for path in STUDIES.glob("*.yaml")}
     of_the_paper = {"cameras", "view-angle", "frames", "pose-distance", "monocular", "nerfies"}
     to_convergence = {"static-converged", "dynamic-converged"}
@@ -34,8 +34,8 @@ def test_studies_that_are_promised_are_there_and_valid() -> None:
     assert [v.frames for v in studies["frames"].variants.values()] == [1, 5, 10, 20, 40]
 
 
-def test_claims_are_sentences_of_the_paper_or_parts_of_one() -> None:
-    """Its parentheses are left out, an ellipsis stands for words, and a quote may begin and end within a sentence."""
+def test_claims_quote_sentences_of_the_paper() -> None:
+    """Quotes omit parentheses, mark other omissions by an ellipsis, and may begin and end within a sentence."""
     paper = SHARED_DATA.parent / "reference" / "h-nerf-paper.tex"
     if not paper.exists():
         pytest.skip("the paper is not beside this checkout")
@@ -47,7 +47,7 @@ def test_claims_are_sentences_of_the_paper_or_parts_of_one() -> None:
             assert any(all(part in sentence for part in parts) for sentence in sentences), claim.says
 
 
-def test_methods_of_ready_studies_have_valid_settings() -> None:
+def test_methods_of_committed_studies_have_valid_settings() -> None:
     for path in STUDIES.glob("*.yaml"):
         study = load_study(path.stem)
         for method in study.methods:
@@ -75,7 +75,7 @@ def test_bad_studies_are_refused_by_key(tmp_path: Path, text: str, message: str)
         load_study(write(tmp_path, text))
 
 
-def test_wide_methods_are_the_small_ones_but_for_their_networks() -> None:
+def test_wide_methods_differ_from_small_ones_only_in_their_networks() -> None:
     for name, widths in {"nerf": 256, "idr": 512, "neural-body": 256, "nerfies": 256}.items():
         small, wide = load_settings(name).training, load_settings(f"{name}-wide").training
         own = wide.field
@@ -88,7 +88,7 @@ def test_unknown_studies_are_refused() -> None:
         load_study("speed")
 
 
-def test_parts_by_number_and_by_name() -> None:
+def test_parts_are_selected_by_number_or_by_name() -> None:
     assert Variant().select(RECORDED) == (None, None, None)
     assert Variant(cameras=2, frames=3, novel_poses=False).select(RECORDED) == (("a", "c"), (0, 4, 8), ())
     assert Variant(cameras=3, frames=1).select(RECORDED) == (("a", "b", "c"), (0,), None)
@@ -104,7 +104,7 @@ def test_parts_by_number_and_by_name() -> None:
         (Variant(frames=(3,)), "ada: no training frame 3; there are 0, 2, 4, 6, 8"),
     ],
 )
-def test_what_was_not_recorded_is_refused(variant: Variant, message: str) -> None:
+def test_cameras_and_frames_that_were_not_recorded_are_refused(variant: Variant, message: str) -> None:
     with pytest.raises(InputError, match=message):
         variant.select(RECORDED)
 
@@ -115,7 +115,7 @@ def test_snapshots_halve_the_limit_or_double_from_a_quarter_minute() -> None:
     assert snapshot_times_s(80.0, 0) == ()
 
 
-def test_narrowing_keeps_methods_where_they_were_and_tries_presets_everywhere() -> None:
+def test_restricting_keeps_methods_in_their_variants_and_adds_presets_to_all() -> None:
     study = BenchmarkStudy(
         title="t", seconds=60, methods=("a", "b"), variants={"all": Variant(methods=("b",)), "one": Variant(frames=1)}
     )
@@ -138,7 +138,7 @@ def test_less_time_than_the_first_training_until_flat_is_refused() -> None:
         study.restricted_to([], 5.0)
 
 
-def test_methods_keep_the_order_of_the_study_and_own_presets_are_known() -> None:
+def test_methods_keep_the_order_of_the_study_and_own_presets_are_recognised() -> None:
     study = load_study("cameras").restricted_to(["idr", "demo", "nerf", "fast", "idr"], None)
     assert study.methods == ("fast", "nerf", "idr", "demo")
     assert all(variant.methods == study.methods for variant in study.variants.values())
@@ -146,7 +146,7 @@ def test_methods_keep_the_order_of_the_study_and_own_presets_are_known() -> None
     assert load_study("cameras").restricted_to(["nerf"], None).own_methods() == []
 
 
-def test_only_the_clock_ends_a_compared_method() -> None:
+def test_compared_methods_end_by_time_not_by_steps() -> None:
     study = load_study("dynamic")
     steps = {name: study.settings(name).training.steps for name in ("fast", "paper", "neural-body", "nerfies")}
     assert steps == {"fast": 0, "paper": 10_000, "neural-body": 1_000_000, "nerfies": 1_000_000}

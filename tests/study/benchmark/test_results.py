@@ -141,8 +141,8 @@ def test_the_markdown_by_hand() -> None:
     assert text.endswith("LPIPS: not available: no weights.\n\nBy eye.\n")
 
 
-def test_what_methods_had_on_the_way_and_why_they_ended() -> None:
-    """Expect nerf, from 22 dB at 10 s to 26 at 1000, to have 22 + 2 lg 60 at 600 s. idr was never scored."""
+def test_methods_trained_until_flat_have_a_table_of_progress_and_end_reasons() -> None:
+    """nerf rises from 22 dB at 10 s to 26 at 1000 s, so it has 22 + 2 lg 60 at 600 s. idr was never scored."""
     flat = result(until_flat=True)
     methods = flat["variants"]["4 cameras"]["methods"]
     methods["fast"] |= {
@@ -164,8 +164,8 @@ def test_what_methods_had_on_the_way_and_why_they_ended() -> None:
     assert "each from the start" in caption(flat) and "60 s at most" in caption(flat)
 
 
-def test_new_poses_have_three_columns_and_surfaces_one() -> None:
-    """Let the compared method tune nothing."""
+def test_new_poses_have_three_image_columns_and_one_surface_column() -> None:
+    """The compared method tunes no poses."""
     several = result()
     methods = several["variants"]["4 cameras"]["methods"]
     columns = {"novel_pose": 27.0, "novel_pose_posed": 28.0, "novel_pose_tracked": 29.0}
@@ -183,7 +183,7 @@ def test_new_poses_have_three_columns_and_surfaces_one() -> None:
     assert nerf["novel_pose_tracked.psnr"] == "" and "novel_pose_tracked.geometry.iou" not in fast
 
 
-def test_what_calibration_left_out_is_told_and_not_plotted() -> None:
+def test_cameras_that_calibration_left_out_are_noted_and_not_plotted() -> None:
     of_three = result()
     of_three["variants"]["4 cameras"]["methods"]["fast"]["trained_on"] = {"cameras": 3, "frames": 1}
     text = as_markdown(of_three, [], [])
@@ -204,7 +204,7 @@ def test_the_csv_has_a_row_for_each_method_of_each_variant() -> None:
     assert rows[2]["error"] == "a | b" and rows[2]["novel_view.psnr"] == ""
 
 
-def test_what_charts_show() -> None:
+def test_data_of_charts_by_hand() -> None:
     variants = result()["variants"]
     assert heading("4 cameras", variants["4 cameras"]) == "4 cameras, new views"
     assert smallest_timed_px(result()) == "256"
@@ -229,14 +229,14 @@ def test_captions_name_limit_and_machine() -> None:
 
 
 def write_pictures(store: Path) -> None:
-    """Write the pictures of each method."""
+    """Write the images of each method."""
     for name, grey in (("f", 200), ("n", 90)):
         for kind in ("render", "truth"):
             path = store / "scoring" / name / "pictures" / f"0-{kind}.png"
             write_image(path, np.full((40, 30, 3), grey, np.uint8))
 
 
-def test_methods_that_were_scored_on_other_images_are_published(tmp_path: Path) -> None:
+def test_methods_scored_on_different_images_have_rows_of_their_own(tmp_path: Path) -> None:
     write_pictures(tmp_path)
     several = result()
     methods = several["variants"]["4 cameras"]["methods"]
@@ -249,14 +249,14 @@ def test_methods_that_were_scored_on_other_images_are_published(tmp_path: Path) 
     ]
 
 
-def test_curves_without_a_figure_at_their_end_have_no_front(tmp_path: Path) -> None:
+def test_a_study_without_final_scores_is_published_without_a_pareto_front(tmp_path: Path) -> None:
     nothing = scores(30.0, 0.5, "") | {"pictures": []}
     nothing["novel_view"] |= {"psnr": None, "per_image": []}
     publish(result(sweep=None, variants={"all": {"cameras": 4, "frames": 1, "methods": {"fast": nothing}}}), tmp_path)
     assert (tmp_path / "benchmark" / "ada-toy.png").exists()
 
 
-def test_everything_is_published_and_old_charts_go(tmp_path: Path) -> None:
+def test_everything_is_published_and_old_charts_are_removed(tmp_path: Path) -> None:
     write_pictures(tmp_path)
     table = publish(result(), tmp_path)
     assert table == tmp_path / "benchmark" / "ada-toy.md"
@@ -269,12 +269,12 @@ def test_everything_is_published_and_old_charts_go(tmp_path: Path) -> None:
     assert {path.suffix for path in table.parent.iterdir()} == {".md", ".csv", ".json"}
 
 
-def test_methods_differ_in_line_and_marker_so_that_grey_prints_do() -> None:
+def test_methods_differ_in_line_and_marker_for_prints_in_grey() -> None:
     looks = charts.styles([f"method {k}" for k in range(6)]).values()
     assert len({look["linestyle"] for look in looks}) == len({look["marker"] for look in looks}) == 6
 
 
-def test_ends_with_a_reason_are_marked_and_named() -> None:
+def test_curve_ends_with_a_reason_are_marked_and_labelled() -> None:
     _, axes = charts._figure(1, 1)
     curves = {"a": [(10.0, 20.0), (20.0, 30.0)], "b": [(10.0, 21.0), (40.0, 25.0)]}
     charts.draw_curves(axes[0][0], curves, charts.styles(curves), {"a": "flat"})
@@ -283,7 +283,7 @@ def test_ends_with_a_reason_are_marked_and_named() -> None:
     assert [line.get_xydata().tolist() for line in bars] == [[[20.0, 30.0]]]
 
 
-def test_names_at_line_ends_do_not_lie_upon_each_other() -> None:
+def test_labels_at_line_ends_do_not_overlap() -> None:
     figure, axes = charts._figure(1, 1)
     curves = {"a": [(1.0, 20.0), (10.0, 30.0)], "b": [(1.0, 21.0), (10.0, 30.1)], "c": [(1.0, 10.0), (10.0, 15.0)]}
     charts.draw_curves(axes[0][0], curves, charts.styles(curves))

@@ -58,8 +58,7 @@ class SizedBall(BallAvatar):
 def scored(
     base: Path, test_cameras: tuple[str, ...], settings: ScoringSettings = SETTINGS, kind: str = "fast"
 ) -> dict[str, Any]:
-    """Score, into `base`/out, a training of 15 s whose field took 12, with snapshots before and after the field's
-    end."""
+    """Score, into `base`/out, a training of 15 s whose field took 12 s, with snapshots up to the field's end."""
     training = base / "training"
     stored = {"static": False, "training": {"field": {"kind": kind}, "pose_learning_rate": 0}}
     for name, seconds in {"5": 6.5, "10": 10.0, "12": 12.0}.items():  # the first was taken late, after a long step
@@ -80,7 +79,7 @@ def scored(
 
 
 def scene(capture: Capture) -> ScoringScene:
-    """Return what the ball is scored against."""
+    """Return the scene that the ball is scored against."""
     return ScoringScene(capture, ball_fit(), GroundTruth(capture.root, capture), "cpu")
 
 
@@ -100,12 +99,12 @@ def found(base: Path) -> dict[str, Any]:
 
 
 def psnr_db(grey: float, camera: str, frame: int) -> float:
-    """Return the PSNR of a ball in this grey, where only its own pixels are wrong, all by the same amount."""
+    """Return the PSNR of a ball of this grey level: only its own pixels are wrong, all by the same amount."""
     mask = seen(ball_camera(camera, {"a": 0.0, "c": 160.0}[camera]), centre_m(frame))
     return -10 * np.log10(mask[mask_box(mask)].mean() * ((PHOTOGRAPHED - round(grey)) / 255) ** 2)
 
 
-def test_the_curve_is_of_snapshots_when_they_were_taken_and_of_the_end_of_the_field(found: dict[str, Any]) -> None:
+def test_the_curve_has_snapshots_at_their_true_times_and_the_end_of_the_field(found: dict[str, Any]) -> None:
     assert [row["seconds"] for row in found["curve"]] == [6.5, 10.0, 12.0]
     assert found["split"] == "novel_view"
     for row, grey in zip(found["curve"], (51, 76.5, 102), strict=True):
@@ -117,7 +116,7 @@ def test_the_curve_is_of_snapshots_when_they_were_taken_and_of_the_end_of_the_fi
     assert found["training"]["model_mib"] == 7.0
 
 
-def test_of_a_longer_training_the_end_alone_is_scored(base: Path, found: dict[str, Any], tmp_path: Path) -> None:
+def test_only_the_end_of_a_longer_training_is_scored(base: Path, found: dict[str, Any], tmp_path: Path) -> None:
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M + GAP_M)
     with pytest.MonkeyPatch.context() as patch:
@@ -128,7 +127,7 @@ def test_of_a_longer_training_the_end_alone_is_scored(base: Path, found: dict[st
 
 
 def test_curves_of_new_poses_are_animated_and_end_with_the_field(tmp_path: Path) -> None:
-    """Score curves without fitting poses to the finished field. Training raised the novel frame's body by two
+    """Curves are scored without fitting poses to the finished field. Training raised the novel frame's body by two
     pixels."""
     found = scored(tmp_path, ("c",), SETTINGS.model_copy(update={"split": "novel_pose"}))
     assert [row["seconds"] for row in found["curve"]] == [6.5, 10.0, 12.0]
@@ -136,10 +135,10 @@ def test_curves_of_new_poses_are_animated_and_end_with_the_field(tmp_path: Path)
         assert row["psnr"] == pytest.approx(psnr_db(grey, "c", 3), abs=1e-3)
     assert found["novel_pose"]["psnr"] == pytest.approx(psnr_db(102, "c", 3), abs=1e-3)
     assert found["novel_pose"]["mask_iou"] == 1.0
-    for column in ("posed", "tracked"):  # one picture here, as no frame knows anything of itself
+    for column in ("posed", "tracked"):  # one image here, as no frame has parameters of its own
         assert found[f"novel_pose_{column}"]["mask_iou"] < 0.9
         (row,), (animated,) = found[f"novel_pose_{column}"]["per_image"], found["novel_pose"]["per_image"]
-        assert row["view_angle_deg"] == animated["view_angle_deg"]  # of the body that all methods were given
+        assert row["view_angle_deg"] == animated["view_angle_deg"]  # measured on the body that all methods share
         assert "geometry" not in found[f"novel_pose_{column}"]
 
 
@@ -153,7 +152,7 @@ def test_without_a_test_camera_nothing_is_scored_on_images(tmp_path: Path) -> No
     assert not (tmp_path / "out" / "renders").exists()
 
 
-def test_images_stand_beside_their_distance_from_training(found: dict[str, Any]) -> None:
+def test_scores_of_images_include_their_distance_from_training(found: dict[str, Any]) -> None:
     rows = found["novel_view"]["per_image"]
     assert [row["frame"] for row in rows] == [0, 1, 2]
     assert rows[0]["view_angle_deg"] == pytest.approx(80.0, abs=1e-3)  # cameras at 0, 80 and 160 degrees
@@ -162,13 +161,13 @@ def test_images_stand_beside_their_distance_from_training(found: dict[str, Any])
     assert surface["pose_distance_deg"] == 0.0
 
 
-def test_pictures_of_truth_and_rendering_lie_side_by_side(base: Path, found: dict[str, Any]) -> None:
+def test_truth_and_rendering_are_written_for_each_chosen_image(base: Path, found: dict[str, Any]) -> None:
     assert found["pictures"] == [{"camera": "c", "frame": 0}, {"camera": "c", "frame": 2}]
     names = {path.name for path in (base / "out" / "pictures").iterdir()}
     assert names == {f"{k}-{name}.png" for k in (0, 1) for name in ("render", "truth")}
 
 
-def test_a_picture_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     render({"novel_view": BallAvatar(ball_fit())}, capture, [View("novel_view", "c", 1)], tmp_path)
@@ -178,7 +177,7 @@ def test_a_picture_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatc
         write_pictures(scene(capture), "novel_view", shown, tmp_path)
 
 
-def test_a_method_without_poses_has_a_reason_instead_of_figures(tmp_path: Path) -> None:
+def test_a_method_without_poses_has_a_reason_instead_of_scores(tmp_path: Path) -> None:
     found = scored(tmp_path, ("c",), SETTINGS.model_copy(update={"split": "novel_pose"}), "nerf")
     assert found["novel_pose"]["psnr"] is None and found["novel_pose"]["geometry"] is None
     assert found["novel_pose"]["reason"] == "NeRF models one moment"
@@ -186,7 +185,7 @@ def test_a_method_without_poses_has_a_reason_instead_of_figures(tmp_path: Path) 
     assert found["novel_view"]["n"] == 3
 
 
-def test_who_has_no_novel_poses(tmp_path: Path) -> None:
+def test_which_methods_have_no_novel_poses(tmp_path: Path) -> None:
     def reason(kind: str, static: bool) -> str | None:
         stored = {"static": static, "training": {"field": {"kind": kind}, "pose_learning_rate": 0}}
         (tmp_path / "settings.json").write_text(json.dumps(stored))
@@ -198,8 +197,8 @@ def test_who_has_no_novel_poses(tmp_path: Path) -> None:
     assert re.match("Nerfies has no pose", reason("nerfies", False) or "")
 
 
-def test_images_are_chosen_of_those_whose_truth_is_known(tmp_path: Path) -> None:
-    """Ask for one image of three frames, of which only the middle one has a mask."""
+def test_only_images_with_ground_truth_are_chosen(tmp_path: Path) -> None:
+    """One of three frames is to be scored, but only the middle one has a mask."""
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     for frame in (0, 2):
@@ -208,15 +207,15 @@ def test_images_are_chosen_of_those_whose_truth_is_known(tmp_path: Path) -> None
     assert [row["frame"] for row in found["per_image"]] == [1]
 
 
-def test_a_frame_is_timed_at_its_longest_side() -> None:
+def test_the_size_of_a_timed_frame_is_its_longer_side() -> None:
     avatar = SizedBall(ball_fit())
     wide = replace(ball_camera("a", 0.0), width_px=64, height_px=32)
     assert frame_seconds(avatar, wide, 0, 16) > 0
     assert avatar.sizes == [(16, 8)] * 3
 
 
-def test_the_median_of_the_timed_renderings_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They take 1, 9 and 2 s."""
+def test_the_time_of_a_frame_is_the_median_of_renderings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three renderings take 1, 9 and 2 s."""
     clock = iter((0.0, 1.0, 10.0, 19.0, 20.0, 22.0))
     monkeypatch.setattr(scoring.time, "perf_counter", lambda: next(clock))
     assert frame_seconds(BallAvatar(ball_fit()), ball_camera("a", 0.0), 0, 16) == 2.0

@@ -12,17 +12,17 @@ from tests.body.boxes import box_rig
 from tests.evaluation.ball import ball_camera
 
 
-def test_the_angle_is_that_to_the_nearest_camera() -> None:
+def test_the_view_angle_is_measured_to_the_nearest_training_camera() -> None:
     others = [ball_camera("a", 0.0), ball_camera("b", 80.0)]
     assert view_angle_deg(ball_camera("c", 50.0), others, np.array([0, 0, 1.0])) == pytest.approx(30.0)
     assert view_angle_deg(ball_camera("c", -170.0), others, np.array([0, 0, 1.0])) == pytest.approx(110.0)
     assert view_angle_deg(others[0], others, np.array([0, 0, 1.0])) == pytest.approx(0.0, abs=1e-5)
 
 
-def test_a_pose_is_as_far_as_its_free_joints_turn_to_the_nearest_pose_wherever_the_body_stands() -> None:
-    """Turn two free joints. Frame 12 turns one by 90 degrees from frame 10 and 60 from frame 11, whose other joint is
-    the same: 30 in the mean. In frame 14 it is 90 degrees about x against 90 about y: 120 degrees between (a third of a
-    turn about the cube's diagonal), and 90 from frame 10: 45 in the mean."""
+def test_the_distance_of_a_pose_is_the_mean_turn_of_free_joints_from_the_nearest_pose() -> None:
+    """One of two free joints turns. In frame 12 it is 90 degrees from frame 10 and 60 from frame 11: 30 in the mean
+    over both joints. Frame 13 is frame 11 at another place. In frame 14 the joint is turned by 90 degrees about x, not
+    y: 120 degrees from frame 12 (a third of a turn about the cube's diagonal), 90 from frame 10: 45 in the mean."""
     rig = dataclasses.replace(box_rig(), free=torch.tensor([True, True]))
     theta = torch.zeros(5, 2, 3)
     theta[:4, 1, 1] = torch.tensor([0.0, 30.0, 90.0, 30.0]).deg2rad()

@@ -18,7 +18,7 @@ def degraded(tmp_path: Path, kind: str, strength: float, seed: int = 0) -> Captu
     return Capture.load(tmp_path / "bad")
 
 
-def test_cameras_and_frames_that_are_left(tmp_path: Path) -> None:
+def test_the_given_number_of_cameras_or_frames_is_left(tmp_path: Path) -> None:
     one = degraded(tmp_path / "a", "cameras_left", 1)
     assert (len(one.train_cameras), one.test_cameras) == (1, ("03",))
     two = degraded(tmp_path / "b", "frames_left", 2)
@@ -27,14 +27,14 @@ def test_cameras_and_frames_that_are_left(tmp_path: Path) -> None:
     assert two.novel_pose_frames == (8, 10)
 
 
-def test_what_there_is_already_cannot_be_left(tmp_path: Path) -> None:
+def test_keeping_all_cameras_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="ada: has only 2 training cameras; keep fewer than that"):
         degraded(tmp_path, "cameras_left", 2)
 
 
 @pytest.mark.parametrize("kind", ["camera_turned", "camera_out_of_step", "exposure"])
-def test_one_camera_alone_differs_from_none(tmp_path: Path, kind: str) -> None:
-    """Refuse to rotate, delay or darken the only camera: it would change the world itself, and scores would count that
+def test_a_single_camera_cannot_be_made_different_from_others(tmp_path: Path, kind: str) -> None:
+    """Turning, delaying or darkening the only camera would change the world itself, and scores would count that
     against the avatar."""
     capture = write_recording(tmp_path / "good")
     alone = replace(capture, train_cameras=capture.train_cameras[:1])
@@ -53,7 +53,7 @@ def test_one_training_camera_turns_about_its_centre(tmp_path: Path) -> None:
     assert angles_deg["03"] == 0
 
 
-def test_a_late_camera_shows_what_it_saw_before(tmp_path: Path) -> None:
+def test_a_late_camera_shows_its_earlier_frames(tmp_path: Path) -> None:
     bad = degraded(tmp_path, "camera_out_of_step", 2)
     shown = {name: [int(bad.image(name, frame)[0, 0, 0]) for frame in FRAMES] for name in bad.cameras}
     late = [name for name, values in shown.items() if values != [102, 104, 106, 108, 110]]
@@ -73,7 +73,7 @@ def test_a_late_camera_shows_what_it_saw_before(tmp_path: Path) -> None:
         assert [round(255 * float(mask[0, 0])) for mask in likely] == expected  # type: ignore[index]
 
 
-def test_a_late_camera_has_no_mask_where_it_had_none_before(tmp_path: Path) -> None:
+def test_a_late_camera_has_masks_only_of_earlier_frames_with_masks(tmp_path: Path) -> None:
     capture = write_recording(tmp_path / "good")
     for name in capture.train_cameras:
         (capture.root / "masks" / name / "000004.png").unlink()
@@ -83,12 +83,12 @@ def test_a_late_camera_has_no_mask_where_it_had_none_before(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("frames", [0.4, 5])
-def test_a_delay_that_no_frame_shows_cannot_be_tried(tmp_path: Path, frames: float) -> None:
+def test_a_delay_that_no_frame_can_show_is_not_applicable(tmp_path: Path, frames: float) -> None:
     with pytest.raises(NotApplicableError, match=f"ada: has 5 frames; none can be delayed by {frames:g}"):
         degraded(tmp_path, "camera_out_of_step", frames)
 
 
-def test_seeds_differ_and_repeat(tmp_path: Path) -> None:
+def test_seeds_are_repeatable_and_differ(tmp_path: Path) -> None:
     cameras = [degraded(tmp_path / f"{k}", "camera_turned", 1, seed).cameras for k, seed in enumerate((0, 0, 1))]
     turns = [np.stack([camera.R for camera in rig.values()]) for rig in cameras]
     assert np.array_equal(turns[0], turns[1])
@@ -96,7 +96,7 @@ def test_seeds_differ_and_repeat(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("strengths", [(), (1.0, 3.0, 2.0), (1.0, 1.0), (0.0, 1.0), (float("nan"),), (float("inf"),)])
-def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
+def test_strengths_must_rise_within_bounds(strengths: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="mask_holes: give numbers between 0 and 100 that rise, the mildest first"):
         check_strengths("mask_holes", strengths)
 
@@ -116,17 +116,17 @@ def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
         ("mask_limb", (50, 120), "numbers between 0 and 100 that rise"),
     ],
 )
-def test_each_kind_has_its_way_and_bounds(kind: str, strengths: tuple[float, ...], expected: str) -> None:
+def test_each_kind_has_its_own_direction_and_bounds(kind: str, strengths: tuple[float, ...], expected: str) -> None:
     with pytest.raises(InputError, match=f"degradation {kind}: give {expected}, the mildest first"):
         check_strengths(kind, strengths)
 
 
-def test_bounds_that_can_be_reached_are_strengths() -> None:
+def test_reachable_bounds_are_accepted_as_strengths() -> None:
     check_strengths("cameras_left", (3, 2, 1))
     check_strengths("mask_limb", (10, 100))
 
 
-def test_kinds_are_told_apart_by_their_labels() -> None:
+def test_kinds_have_different_labels() -> None:
     labels = [kind.label for kind in KINDS.values()]
     assert len(set(labels)) == len(labels)
 

@@ -18,7 +18,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def standing() -> np.ndarray:
     """Return keypoints (2, 25, 3) of a person who faces -y in two frames: hips 20 cm apart at 1 m, knees 30 cm at 0.5
-    m, ears 16 cm at 1.6 m, the nose before them."""
+    m, ears 16 cm at 1.6 m, the nose in front of them."""
     keypoints_m = np.zeros((2, 25, 3))
     for name, x, y, z in (
         ("R_HIP", -0.1, 0, 1.0), ("L_HIP", 0.1, 0, 1.0), ("R_KNEE", -0.15, 0, 0.5), ("L_KNEE", 0.15, 0, 0.5),
@@ -29,9 +29,9 @@ def standing() -> np.ndarray:
 
 
 def test_a_skirt_hangs_from_the_hips_to_the_knees_and_its_folds_move() -> None:
-    """Expect a waist of 20 cm, the distance of the hips, around (0, 0, 1), and a hem of 10 + 10 cm, plus or minus folds
-    of 3 cm, off the line between the knees at 0.5 m, of which it reaches tanh 2 of either half to the left and the
-    right."""
+    """Expect a waist of radius 20 cm, the distance between the hips, around (0, 0, 1), and a hem at 0.5 m, 10 + 10 cm,
+    plus or minus folds of 3 cm, off the line between the knees. To the left and the right, the hem is measured from
+    tanh 2 of either half of that line."""
     made = skirt(standing(), UP, 0.1, np.random.default_rng(0))
     first = made.vertices_m[0]
     rings_m = first[:-2].reshape(clothing.RINGS, clothing.RING_VERTICES, 3)
@@ -46,9 +46,9 @@ def test_a_skirt_hangs_from_the_hips_to_the_knees_and_its_folds_move() -> None:
     assert np.abs(made.vertices_m[1] - first).max() > 1e-3
 
 
-def test_what_is_worn_is_a_closed_surface_with_its_inside_inside() -> None:
-    """Around knees that touch, a skirt without flare is a cone from 0.2 to 0.1 m over 0.5 m, less 0.16 % for having 64
-    corners."""
+def test_a_garment_is_a_closed_surface_facing_outwards() -> None:
+    """Around knees that touch, a skirt without flare is a truncated cone with radii of 0.2 and 0.1 m, 0.5 m high.
+    Having 64 corners takes off 0.16 %."""
     keypoints_m = standing()
     keypoints_m[:, [clothing.R_KNEE, clothing.L_KNEE], 0] = 0
     made = skirt(keypoints_m, UP, 1e-9, np.random.default_rng(0))
@@ -59,8 +59,8 @@ def test_what_is_worn_is_a_closed_surface_with_its_inside_inside() -> None:
 
 
 def test_hair_hangs_behind_the_head() -> None:
-    """Expect 40 cm from the ears down, its middle 0.55 x 16 cm behind them and 0.15 x 40 cm more at its end, 0.35 x 16
-    cm thick to either side."""
+    """Expect hair down to 40 cm below the ears. Its middle is 0.55 x 16 cm behind them, and 0.15 x 40 cm more at its
+    end; it extends 0.35 x 16 cm to the front and the back of that."""
     made = long_hair(standing(), UP, 0.4, np.random.default_rng(0))
     rings_m = made.vertices_m[0][:-2].reshape(clothing.RINGS, clothing.RING_VERTICES, 3)
     assert (rings_m[0, 0, 2], rings_m[-1, 0, 2]) == pytest.approx((1.6, 1.2))
@@ -81,9 +81,9 @@ def column(keypoints_m: np.ndarray, up: np.ndarray, half_m: float, rng: np.rando
 
 
 def dressed(tmp_path: Path) -> tuple[Capture, GroundTruth]:
-    """Draw clothing into the capture of tests/study/recording.py, in which a body of 1 m³ stands before camera 01
-    and hides a column 0.5 m thick; the truth is known for the middle 2 x 2 px of camera 03, and is a triangle in
-    frame 2."""
+    """Draw clothing into the capture of tests/study/recording.py, in which a body of 1 m³ stands in front of camera
+    01 and hides a column 0.5 m thick. The ground truth, of frame 2, is a mask of the middle 2 x 2 px of camera 03, and
+    a triangle."""
     good = write_recording(tmp_path / "good")
     write_detected(good)
     folder = good.root / "ground_truth"
@@ -99,7 +99,7 @@ def dressed(tmp_path: Path) -> tuple[Capture, GroundTruth]:
     return bad, GroundTruth(bad.root, bad)
 
 
-def test_what_is_worn_is_seen_where_the_body_does_not_hide_it(tmp_path: Path) -> None:
+def test_a_garment_is_drawn_where_the_body_does_not_hide_it(tmp_path: Path) -> None:
     """A column 1 m high and 0.5 m wide, 4 m from a camera of 16 px focal length, is about 4 x 2 px around the middle;
     where it is nearest, at 3.75 m, half a metre is 2.13 px."""
     bad, _ = dressed(tmp_path)
@@ -117,7 +117,7 @@ def test_what_is_worn_is_seen_where_the_body_does_not_hide_it(tmp_path: Path) ->
     assert bad.background("02").mean() == pytest.approx(50, abs=1)  # type: ignore[union-attr]
 
 
-def test_the_truth_wears_it_too(tmp_path: Path) -> None:
+def test_a_garment_is_added_to_the_ground_truth_too(tmp_path: Path) -> None:
     bad, truth = dressed(tmp_path)
     assert (truth.has_mask("03", 2), truth.has_mask("03", 4)) == (True, False)
     assert truth.mask("03", 2)[6:10, 7:9].all()

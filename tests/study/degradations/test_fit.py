@@ -18,7 +18,7 @@ def body() -> BodyFit:
     return BodyFit(rig, FRAMES, theta, torch.eye(4).repeat(len(FRAMES), 1, 1))
 
 
-def test_pose_noise_is_root_mean_square_degrees_of_joints_that_move(body: BodyFit) -> None:
+def test_pose_noise_is_the_rms_angle_of_moving_joints(body: BodyFit) -> None:
     turned = Degradation(kind="pose_noise", strength=5, seed=0).apply(body).theta
     moves = body.rig.free & (body.rig.parents >= 0)
     angles_deg = torch.rad2deg(turned.norm(dim=-1))
@@ -26,7 +26,7 @@ def test_pose_noise_is_root_mean_square_degrees_of_joints_that_move(body: BodyFi
     assert not angles_deg[:, ~moves].any()
 
 
-def test_a_wrong_shape_moves_vertices_by_as_much(body: BodyFit) -> None:
+def test_a_wrong_shape_moves_vertices_by_the_given_millimetres(body: BodyFit) -> None:
     bad = Degradation(kind="wrong_shape", strength=20, seed=3).apply(body)
     moved_m = bad.rig.vertices_m - body.rig.vertices_m
     assert float(moved_m.square().sum(-1).mean().sqrt()) == pytest.approx(0.020, rel=1e-4)
@@ -41,7 +41,7 @@ def test_extreme_poses_start_from_recorded_ones(body: BodyFit) -> None:
     assert torch.equal(root, torch.eye(4).repeat(300, 1, 1))
 
 
-def test_learning_rates_and_nothing_else_change() -> None:
+def test_only_learning_rates_change() -> None:
     fast = load_settings("fast").training
     changed = degrade_settings(fast, Degradation(kind="learning_rate_up", strength=10, seed=0))
     assert (changed.field.grid_learning_rate, changed.field.network_learning_rate) == pytest.approx((0.5, 0.1))

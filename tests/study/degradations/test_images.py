@@ -10,7 +10,7 @@ from tests.study.degradations.test_cameras import degraded
 from tests.study.recording import SIZE_PX, write_recording
 
 
-def test_noise_has_its_spread_in_training_cameras_alone(tmp_path: Path) -> None:
+def test_noise_has_the_given_spread_in_training_cameras_only(tmp_path: Path) -> None:
     bad = degraded(tmp_path, "image_noise", 10)
     noise = np.stack([bad.image(name, frame).astype(float) - 100 - frame for name in ("01", "02") for frame in (2, 4)])
     assert noise.std() == pytest.approx(10, rel=0.1)  # 3072 values, through JPEG of quality 95
@@ -21,7 +21,7 @@ def test_noise_has_its_spread_in_training_cameras_alone(tmp_path: Path) -> None:
     assert bad.given_mask("01", 2).sum() == 64  # type: ignore[union-attr]
 
 
-def test_noise_leaves_what_was_detected(tmp_path: Path) -> None:
+def test_noise_leaves_detections_unchanged(tmp_path: Path) -> None:
     bad = degraded(tmp_path, "image_noise", 10)
     assert bad.has_person_masks
     good = Capture.load(tmp_path / "good")
@@ -39,18 +39,18 @@ def test_blur_spreads_by_a_share_of_the_width(tmp_path: Path) -> None:
     write_image(good.root / "images" / "01" / "000002.png", dot)
     blur(good, 6.25, np.random.default_rng(0), tmp_path / "bad")  # 1 px
     shown = Capture.load(tmp_path / "bad").image("01", 2)[..., 0].astype(int)
-    # 255 / (2 pi) = 40.6 in the middle, times exp(-1 / 2) beside it, exp(-2) two pixels away; JPEG errs by a few levels
+    # 255 / (2 pi) = 40.6 in the middle, times exp(-1 / 2) next to it, exp(-2) two pixels away; JPEG: a few levels off
     assert [shown[8, 8], shown[8, 9], shown[7, 8], shown[8, 10]] == pytest.approx([40.6, 24.6, 24.6, 5.5], abs=4)
 
 
-def test_exposures_are_shared_out(tmp_path: Path) -> None:
+def test_one_camera_gets_darker_and_one_brighter(tmp_path: Path) -> None:
     bad = degraded(tmp_path, "exposure", 1)
     assert sorted(int(bad.image(name, 2)[0, 0, 0]) for name in ("01", "02")) == [51, 204]  # 102 / 2, 102 x 2
     assert sorted(int(bad.background(name)[0, 0, 0]) for name in ("01", "02")) == [25, 100]  # type: ignore[index]
     assert bad.image("03", 2)[0, 0, 0] == 102
 
 
-def test_half_size(tmp_path: Path) -> None:
+def test_halving_images_also_scales_cameras_masks_and_points(tmp_path: Path) -> None:
     bad = degraded(tmp_path, "small_images", 0.5)
     assert bad.image("01", 2).shape == (8, 8, 3)
     assert bad.image("03", 2).shape == (16, 16, 3)
@@ -72,12 +72,12 @@ def test_half_size(tmp_path: Path) -> None:
     assert (255 * likely).round().sum() == 16 * 200 + 48 * 2
 
 
-def test_the_person_stands_where_rays_meet(tmp_path: Path) -> None:
+def test_the_middle_of_the_person_is_where_rays_meet(tmp_path: Path) -> None:
     """Expect (0, 0, 1), where both axes cross: the keypoints' mean is 0.1 px or so off the images' middle."""
     assert person_middle(write_recording(tmp_path)) == pytest.approx([0, 0, 1], abs=0.1)
 
 
-def test_the_pillar_stands_on_the_way_to_the_camera(tmp_path: Path) -> None:
+def test_the_pillar_stands_between_the_person_and_the_camera(tmp_path: Path) -> None:
     camera = write_recording(tmp_path).cameras["01"]  # at (-4, 0, 1)
     corners_m = pillar(np.array([0.0, 0, 1]), camera, np.array([0.0, 0, 1]), 0.5)
     assert corners_m.min(0) == pytest.approx([-1.85, -0.25, -0.2])
@@ -85,10 +85,10 @@ def test_the_pillar_stands_on_the_way_to_the_camera(tmp_path: Path) -> None:
 
 
 def test_a_pillar_hides_pixels_masks_and_points_of_the_camera_behind_it(tmp_path: Path) -> None:
-    """At 2.15 m from a camera of 16 px focal length, where it is nearest, 0.5 m are 3.7 px; the other camera sees it
-    1.35 m to the left of the person and not in front of them."""
+    """Its nearest side is 2.15 m from the camera, so at a focal length of 16 px, 0.5 m are 3.7 px. The other camera
+    sees the pillar 1.35 m to the left of the person, not in front of them."""
     bad = degraded(tmp_path, "occluder", 0.5)
-    grey = {name: (bad.image(name, 2).astype(int).max(-1) < 99).sum(0) for name in bad.cameras}  # rows a column
+    grey = {name: (bad.image(name, 2).astype(int).max(-1) < 99).sum(0) for name in bad.cameras}  # rows per column
     behind = [name for name, columns in grey.items() if columns.any()]
     assert len(behind) == 1
     assert behind[0] in ("01", "02")

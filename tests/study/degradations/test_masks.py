@@ -28,7 +28,7 @@ def changed(tmp_path: Path, kind: str, strength: float) -> list[np.ndarray]:
     return [bad.get("01", frame) for frame in (2, 4)]
 
 
-def test_three_per_cent_of_the_width_are_three_pixels(tmp_path: Path) -> None:
+def test_masks_are_eroded_or_dilated_by_three_per_cent_of_the_width(tmp_path: Path) -> None:
     eroded, _ = changed(tmp_path, "mask_eroded", 3)
     assert eroded.sum() == 34 * 34
     assert eroded[23:57, 33:67].all()
@@ -38,17 +38,17 @@ def test_three_per_cent_of_the_width_are_three_pixels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["mask_eroded", "mask_dilated"])
-def test_less_than_a_pixel_changes_no_mask_and_is_left_out(kind: str, tmp_path: Path) -> None:
-    """Take 0.9 % of 100 px: the nearest pixels across an edge are 1 px apart. 1 % takes or adds one ring."""
+def test_eroding_or_dilating_by_less_than_a_pixel_is_not_applicable(kind: str, tmp_path: Path) -> None:
+    """The nearest pixels across an edge are 1 px apart, more than 0.9 % of 100 px. 1 % removes or adds one ring."""
     with pytest.raises(NotApplicableError, match="ada: no mask would differ"):
         changed(tmp_path, kind, 0.9)
     ringed, _ = changed(tmp_path, kind, 1)
     assert ringed.sum() == (38 * 38 if kind == "mask_eroded" else 40 * 40 + 4 * 40)
 
 
-def test_holes_take_their_share_and_no_more_than_a_disc_over(tmp_path: Path) -> None:
+def test_holes_take_their_share_to_within_one_disc(tmp_path: Path) -> None:
     pierced = changed(tmp_path, "mask_holes", 25)
-    disc = 60  # radius of 0.1 x 40 = 4 px
+    disc = 60  # px, at most, for a radius of 0.1 x 40 = 4 px
     for mask in pierced:
         assert 1200 - disc < mask.sum() <= 1200
         assert not mask[~masks().get("01", 2)].any()
@@ -56,7 +56,7 @@ def test_holes_take_their_share_and_no_more_than_a_disc_over(tmp_path: Path) -> 
 
 
 def test_a_limb_is_cut_off_around_its_bone(tmp_path: Path) -> None:
-    """Put all limbs' keypoints at the same two places: expect a cut from (40, 40) to (50, 40), on to (55, 40), 8 px
+    """All limbs' keypoints are at the same two places. Expect a cut from (40, 40) through (50, 40) to (55, 40), 8 px
     thick."""
     capture = write_recording(tmp_path)
     people = np.zeros((5, 1, 25, 3))
@@ -71,8 +71,8 @@ def test_a_limb_is_cut_off_around_its_bone(tmp_path: Path) -> None:
     assert (columns.min(), columns.max()) == pytest.approx((36, 59), abs=1)
 
 
-def test_limbs_that_chance_leaves_on_all_masks_are_left_out(tmp_path: Path) -> None:
-    """Cut limbs from 1 % of two masks with seed 0, which draws .64 and .04."""
+def test_cutting_limbs_is_not_applicable_if_chance_spares_all_masks(tmp_path: Path) -> None:
+    """Limbs are to be cut from 1 % of two masks, but seed 0 draws .64 and .04."""
     capture = write_recording(tmp_path)
     with pytest.raises(NotApplicableError, match="ada: no mask would differ"):
         Degradation(kind="mask_limb", strength=1, seed=0).apply(masks(), capture)

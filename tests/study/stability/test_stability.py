@@ -24,7 +24,7 @@ def test_the_full_study_tries_everything_at_four_or_five_strengths_and_three_see
     assert full.left_out() == []
 
 
-def test_the_brief_studies_train_alike_all_strengths_once_or_the_milder_ones_with_three_seeds() -> None:
+def test_brief_has_all_strengths_with_one_seed_and_seeds_the_milder_ones_with_three() -> None:
     full, brief, seeds = load_stability("full"), load_stability("brief"), load_stability("seeds")
     assert brief.degradations == full.degradations
     assert seeds.degradations == {name: full.degradations[name][:2] for name in seeds.degradations}
@@ -53,7 +53,7 @@ def test_studies_of_other_methods_and_of_full_training() -> None:
             load_settings(method, list(study.overrides))
 
 
-def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_out() -> None:
+def test_the_quick_study_has_the_two_mildest_strengths_and_lists_what_it_leaves_out() -> None:
     full, quick = load_stability("full"), load_stability("quick")
     assert quick.degradations == {name: full.degradations[name][:2] for name in quick.degradations}
     for method in quick.methods:
@@ -91,7 +91,7 @@ def test_unknown_studies_and_degradations_are_refused() -> None:
 
 
 def run(method: str, kind: str, strength: float | None, seed: int, verdict: str, psnr: float | None) -> dict[str, Any]:
-    """Return a row, without scores if there is no PSNR and the verdict is not good."""
+    """Return a row of results, with scores if the verdict is ok or degraded."""
     row = {"method": method, "kind": kind, "strength": strength, "seed": seed, "verdict": verdict, "reason": ""}
     if verdict in ("ok", "degraded"):
         good = {"psnr": 30.0 + seed, "ssim": 0.9, "chamfer_mm": 6.0 - seed}
@@ -119,13 +119,13 @@ RESULT = {
 }
 
 
-def test_a_method_holds_as_far_as_its_worst_seed_is_ok() -> None:
+def test_a_method_holds_up_to_the_strength_at_which_all_seeds_are_ok() -> None:
     assert tolerated_strength(RESULT, "fast", "pose_noise") == "holds to 1, failed at 2"
     assert tolerated_strength(RESULT, "fast", "mask_holes") == "holds to 5"
     assert tolerated_strength(RESULT, "nerf", "mask_holes") == "refused at 5"
 
 
-def test_what_is_degraded_does_not_hold_though_a_stronger_one_is_ok() -> None:
+def test_a_method_does_not_hold_at_a_degraded_strength_even_if_a_stronger_one_is_ok() -> None:
     words = {1: "degraded", 2: "ok", 5: "failed"}
     rows = [run("fast", "pose_noise", s, 0, word, 30.0) for s, word in words.items()]
     result = RESULT | {"runs": [run("fast", "as recorded", None, 0, "ok", 30.0), *rows]}
@@ -135,15 +135,15 @@ def test_what_is_degraded_does_not_hold_though_a_stronger_one_is_ok() -> None:
     assert tolerated_strength(result | {"runs": rows}, "fast", "pose_noise") == "holds to 1, degraded at 2, failed at 5"
 
 
-def test_a_seed_without_a_good_run_says_nothing_of_the_others() -> None:
-    """Let seed 1 refuse the capture as recorded while seed 0 holds."""
+def test_a_seed_whose_reference_run_failed_is_ignored() -> None:
+    """Seed 1 fails on the capture as recorded, while seed 0 holds."""
     rows = [run("fast", "as recorded", None, 0, "ok", 30.0), run("fast", "as recorded", None, 1, "failed", None)]
     result = RESULT | {"runs": [*rows, run("fast", "pose_noise", 1, 0, "ok", 30.0)]}
     assert tolerated_strength(result, "fast", "pose_noise") == "holds to 1"
     assert tolerated_strength(result, "fast", "mask_holes") == "-"
 
 
-def test_nothing_is_said_to_hold_of_which_nothing_is_known() -> None:
+def test_unscored_runs_do_not_count_as_holding() -> None:
     good = run("fast", "as recorded", None, 0, "unscored", None)
     unknown = RESULT | {"runs": [good, run("fast", "pose_noise", 1, 0, "unscored", None)]}
     assert tolerated_strength(unknown, "fast", "pose_noise") == "unscored"
@@ -151,8 +151,8 @@ def test_nothing_is_said_to_hold_of_which_nothing_is_known() -> None:
     assert tolerated_strength(partly, "fast", "pose_noise") == "holds to 1"
 
 
-def test_a_failed_run_to_compare_with_stands_for_all() -> None:
-    """Give it scores as well: pictures that are no better than empty ones."""
+def test_all_strengths_count_as_failed_if_the_reference_run_failed() -> None:
+    """The run has scores, too: its images are no better than empty ones."""
     failed = run("fast", "as recorded", None, 0, "ok", 10.0) | {"verdict": "failed"}
     assert tolerated_strength(RESULT | {"runs": [failed]}, "fast", "pose_noise") == "failed at 1"
 
@@ -189,7 +189,7 @@ def test_the_matrix_has_a_shade_for_each_verdict(tmp_path: Path) -> None:
     assert all(lighter - darker > 15 for darker, lighter in itertools.pairwise(greys))
 
 
-def test_curves_are_drawn_where_there_are_figures(tmp_path: Path) -> None:
+def test_curves_are_drawn_only_if_there_are_scores(tmp_path: Path) -> None:
     assert curve_chart(RESULT, "psnr", tmp_path / "psnr.png")
     assert (tmp_path / "psnr.png").stat().st_size > 10_000
     nothing = RESULT | {"runs": [r for r in RESULT["runs"] if "psnr" not in r]}  # type: ignore[union-attr, operator]

@@ -21,38 +21,40 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
         (None, None, "unscored: no image or surface is scored in both runs"),
     ],
 )
-def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, expected: str) -> None:
+def test_the_worse_of_psnr_and_chamfer_distance_counts(
+    psnr: float | None, chamfer_mm: float | None, expected: str
+) -> None:
     verdict = judge({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, [])
     assert ": ".join(filter(None, (verdict.verdict, verdict.reason))) == expected
 
 
-def test_half_of_what_a_good_run_has_above_an_empty_picture_is_failure() -> None:
-    """Compare with 20 dB where an empty picture has 16."""
+def test_losing_half_of_the_lead_over_an_empty_image_is_failure() -> None:
+    """The reference has 20 dB, an empty image 16."""
     poor = {"psnr": 20.0, "chamfer_mm": None, "empty_psnr": 16.0}
     assert judge(poor | {"psnr": 18.1}, poor, []).verdict == "degraded"
     assert judge(poor | {"psnr": 17.9}, poor, []).verdict == "failed"
 
 
-def test_what_loses_most_of_little_is_failure_though_it_lose_less_than_a_decibel() -> None:
-    """Compare with 17.5 dB where an empty picture has 16: 0.9 dB less is more than half of the difference, 0.7 dB less
+def test_losing_most_of_a_small_lead_is_failure_even_below_a_decibel() -> None:
+    """The reference has 17.5 dB, an empty image 16: a loss of 0.9 dB is more than half of the difference, one of 0.7 dB
     is not."""
     little = {"psnr": 17.5, "chamfer_mm": None, "empty_psnr": 16.0}
     assert judge(little | {"psnr": 16.6}, little, []) == RunVerdict("failed", "0.9 dB of PSNR lost")
     assert judge(little | {"psnr": 16.8}, little, []) == RunVerdict("ok")
 
 
-def test_a_good_run_is_judged_too() -> None:
+def test_the_reference_run_is_judged_too() -> None:
     worthless = {"psnr": 15.0, "chamfer_mm": None, "empty_psnr": 16.0}
     assert judge(worthless, worthless, []).verdict == "failed"
 
 
-def test_a_surface_that_is_no_persons_is_failure_whatever_the_scores() -> None:
+def test_a_faulty_surface_is_failure_whatever_the_scores() -> None:
     assert judge(GOOD, GOOD, ["no surface", "a hole"]) == RunVerdict("failed", "no surface")
     unknown = {"psnr": None, "chamfer_mm": None}
     assert judge(unknown, unknown, ["no surface"]) == RunVerdict("failed", "no surface")
 
 
-def test_surfaces_alone_are_judged_where_nothing_is_to_be_compared() -> None:
+def test_only_surfaces_are_judged_if_there_are_no_scores() -> None:
     assert judge(None, {}, []) == RunVerdict("ok")
     assert judge(None, {}, ["no surface"]) == RunVerdict("failed", "no surface")
 
@@ -63,21 +65,21 @@ def test_surfaces_alone_are_judged_where_nothing_is_to_be_compared() -> None:
         (29.3, 7.0, False),  # 0.7 dB, times 1.17: a fifth less than 1 dB and 1.25 are 0.8 dB and 1.2
         (29.15, 6.0, True),
         (28.85, 6.0, True),
-        (28.7, 6.0, False),  # 1.2 dB is the end of it
+        (28.7, 6.0, False),  # 1.3 dB, over 1.2
         (30.0, 7.4, True),  # times 1.23
         (30.0, 7.9, False),  # times 1.32, over 1.3
-        (28.7, 7.4, False),  # degraded in any case by its pictures
-        (25.0, 6.0, True),  # 5 dB of 6, which are half of the 12 above an empty picture
+        (28.7, 7.4, False),  # degraded in any case by its images
+        (25.0, 6.0, True),  # 5 dB of 6, which is half of the 12 above an empty image
         (30.0, 15.7, True),  # times 2.62, of 2.6 to 3.4
         (30.0, 15.5, False),
     ],
 )
-def test_a_verdict_is_near_a_border_where_a_fifth_of_what_may_be_lost_decides(
+def test_a_verdict_is_near_a_border_if_it_changes_with_limits_a_fifth_lower_or_higher(
     psnr: float, chamfer_mm: float, near: bool
 ) -> None:
     assert near_border({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, []) == near
 
 
-def test_what_surfaces_alone_decide_is_near_no_border() -> None:
+def test_a_verdict_by_surfaces_alone_is_not_near_a_border() -> None:
     assert not near_border(None, {}, [])
     assert not near_border({"psnr": 29.0, "chamfer_mm": 6.0}, GOOD, ["no surface"])
