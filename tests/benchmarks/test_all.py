@@ -69,7 +69,7 @@ def test_changed_code_remakes_a_result_and_keeps_its_time_unless_the_store_is_ne
 
 
 @pytest.mark.parametrize("used", [True, False])
-def test_no_time_is_recorded_if_the_store_already_had_a_training(checkout: Checkout, used: bool) -> None:
+def test_no_time_is_recorded_if_a_training_in_the_store_was_used(checkout: Checkout, used: bool) -> None:
     """The store has a training that is an hour old; using it touches its record."""
     folder = checkout.store / "training" / "a"
     folder.mkdir(parents=True)

@@ -35,7 +35,9 @@ def test_evidence_before_and_after_refining_a_turned_camera(
     assert set(given) == set(used) == {"keypoints", "silhouettes", "matches", "match_pairs"}
     assert given["keypoints"]["02"]["median_px"] > used["keypoints"]["02"]["median_px"] + 1
     # Two degrees at a focal length of 249 px are 8.7 px; most rays in the mean cannot miss.
-    means_px = [sum(said["silhouettes"][name]["mean_px"] for name in wave.train_cameras) for said in (given, used)]
+    means_px = [
+        sum(summary["silhouettes"][name]["mean_px"] for name in wave.train_cameras) for summary in (given, used)
+    ]
     assert means_px[0] > 2 and means_px[1] < 0.5
     assert used["matches"]["02"] == {"count": 0, "reason": "no overlap: no matches"}
     sheet = cv2.imread(str(tmp_path / "witnesses.png"))
@@ -53,10 +55,10 @@ def test_matches_of_a_pair_count_for_both_cameras(wave: Capture, tmp_path: Path)
     matched[0, 0, 1] += 3
     outlines = Outlines({"01": [None], "02": [None]}, (0,))
     evidence = Evidence(wave, keypoints, outlines, Matches({("01", "02"): matched}, wave.frames[0]), None)
-    said = evidence.summarise(cameras, measure(cameras, keypoints))
-    assert said["matches"]["01"] == said["matches"]["02"] == said["match_pairs"]["01 and 02"]
-    assert said["matches"]["01"]["count"] == 1 and 1 < said["matches"]["01"]["median_px"] < 3
-    assert said["silhouettes"] == {"01": {"rays": 0}, "02": {"rays": 0}}
+    summary = evidence.summarise(cameras, measure(cameras, keypoints))
+    assert summary["matches"]["01"] == summary["matches"]["02"] == summary["match_pairs"]["01 and 02"]
+    assert summary["matches"]["01"]["count"] == 1 and 1 < summary["matches"]["01"]["median_px"] < 3
+    assert summary["silhouettes"] == {"01": {"rays": 0}, "02": {"rays": 0}}
     draw_evidence(tmp_path / "sheet.png", evidence, cameras, measure(cameras, keypoints))
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
 
@@ -71,20 +73,20 @@ def test_the_sheet_computes_outline_residuals_twice_and_draws_no_outline_seen_by
     outline = MaskOutline.around(cv2.circle(disc, (disc.shape[1] // 2, disc.shape[0] // 2), 40, 1, cv2.FILLED) > 0)
     outlines = Outlines({"01": [outline, outline], "02": [outline, None]}, (0, 1))
     evidence = Evidence(wave, keypoints, outlines, Matches({}, wave.frames[0]), None)
-    drawn, asked = [], []
+    drawn, calls = [], []
     residuals_px = Outlines.residuals_px
-    monkeypatch.setattr(Outlines, "residuals_px", lambda *given: asked.append(given) or residuals_px(*given))
+    monkeypatch.setattr(Outlines, "residuals_px", lambda *given: calls.append(given) or residuals_px(*given))
     monkeypatch.setattr("hnerf.calibration.sheet._scatter", lambda *given: drawn.append(given) or _scatter(*given))
     draw_evidence(tmp_path / "sheet.png", evidence, cameras, measure(cameras, keypoints))
     assert len(drawn) == len(cameras)  # keypoints alone
-    assert len(asked) == 2
+    assert len(calls) == 2
 
 
 def test_the_report_says_that_there_are_no_masks(wave: Capture) -> None:
     cameras = [wave.cameras[name] for name in wave.train_cameras]
     keypoints = ranked_people(wave)[0].keypoints
-    said = Evidence(wave, keypoints, None, Matches({}, 0), None).summarise(cameras, measure(cameras, keypoints))
-    assert said["silhouettes"].startswith("none: ") and said["match_pairs"] == "no overlap: no matches"
+    summary = Evidence(wave, keypoints, None, Matches({}, 0), None).summarise(cameras, measure(cameras, keypoints))
+    assert summary["silhouettes"].startswith("none: ") and summary["match_pairs"] == "no overlap: no matches"
 
 
 def test_a_single_camera_is_judged_by_the_ground(wave: Capture) -> None:

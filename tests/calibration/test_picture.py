@@ -27,12 +27,12 @@ def test_the_view_from_above_is_not_mirrored(up: str, tmp_path: Path, monkeypatc
 def test_several_cameras_without_keypoints_are_not_labelled_as_one_camera(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = []
-    monkeypatch.setattr(Axes, "text", lambda _, x, y, text, **__: said.append(text))
+    labels = []
+    monkeypatch.setattr(Axes, "text", lambda _, x, y, text, **__: labels.append(text))
     status = {"c0": "ok", "c1": "ok", "c2": "unjudged"}
     draw_cameras(tmp_path / "cameras.png", ring(3), status, "z", None, None)
     draw_cameras(tmp_path / "cameras.png", ring(3), {**status, "c1": "unjudged"}, "z", None, None)
-    assert said == ["no keypoints: no residuals", "one camera: no residuals"]
+    assert labels == ["no keypoints: no residuals", "one camera: no residuals"]
 
 
 def test_a_camera_at_the_origin_is_drawn() -> None:

@@ -31,7 +31,7 @@ def outlines(cameras: list[Camera], corners_m: np.ndarray = CORNERS_M) -> Outlin
     return Outlines({camera.name: [MaskOutline.around(mask(camera, corners_m))] for camera in cameras}, (0,))
 
 
-def test_distance_and_points_by_hand() -> None:
+def test_distances_and_points_of_an_outline_by_hand() -> None:
     square = np.zeros((20, 30), bool)
     square[5:15, 10:20] = True
     square[8:10, 12:14] = False  # a hole and a speck, errors of the mask

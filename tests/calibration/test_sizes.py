@@ -23,7 +23,7 @@ def with_bars(narrow: Capture) -> Capture:
     return dataclasses.replace(narrow, picture_areas_px={"c1": Area(0, 37.0, 1000, 926)})
 
 
-def test_each_change_by_hand() -> None:
+def test_each_size_change_by_hand() -> None:
     # f = 1000, principal point 499.5; the image was 80 px wider when calibrated.
     camera = ring(1)[0]
     changed = {what: change(camera, (1080, 1000), (1000, 1000)).K for what, change in SIZE_CHANGES.items()}

@@ -106,8 +106,8 @@ def test_an_offset_of_unknown_error_is_reported_without_one(tmp_path: Path, no_p
     """Nine of twelve frames are left, too few to measure the remaining offset."""
     report = check_calibration(capture_of(tmp_path, recorded({"c2": 3.0}, frames=12, speed=2)), SETTINGS)
     assert np.isnan(report.verdicts["c2"].timing.error_frames)
-    told = next(reason for reason in report.verdicts["c2"].reasons if reason.startswith("out of step"))
-    assert told == f"out of step by {report.verdicts['c2'].frame_offset:+.2f} frames: corrected"
+    stated = next(reason for reason in report.verdicts["c2"].reasons if reason.startswith("out of step"))
+    assert stated == f"out of step by {report.verdicts['c2'].frame_offset:+.2f} frames: corrected"
 
 
 def test_unsynchronised_strided_frames_are_refused_with_what_to_cut(tmp_path: Path, no_pictures: None) -> None:

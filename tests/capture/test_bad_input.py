@@ -81,18 +81,21 @@ EASYMOCAP = {
     "extri missing": (lambda f: (f / "extri.yml").unlink(), "extri.yml"),
     "intri is a pickle": (lambda f: (f / "intri.yml").write_bytes(pickle.dumps(Bomb())), "intri.yml"),
     "intri is an ASCII pickle": (lambda f: (f / "intri.yml").write_bytes(pickle.dumps(Bomb(), 0)), "intri.yml"),
-    "intri is nested deeply": (lambda f: (f / "intri.yml").write_text("%YAML:1.0\n---\na: " + "[" * 5000), "intri.yml"),
+    "intri is deeply nested": (lambda f: (f / "intri.yml").write_text("%YAML:1.0\n---\na: " + "[" * 5000), "intri.yml"),
     "NaN in K": (lambda f: _edit(f / "intri.yml", "20.", ".Nan"), "intri.yml: K_01"),
     "NaN in T": (lambda f: _edit(f / "extri.yml", "data: [ 0., 1., 3. ]", "data: [ .Nan, 1., 3. ]"), "extri.yml: T_01"),
     "plain nan in K": (lambda f: _edit(f / "intri.yml", "20.", "nan"), "intri.yml: camera 01: K"),
-    "K of zero focal length": (lambda f: _edit(f / "intri.yml", "20.", "0."), "intri.yml"),
+    "zero focal length in K": (lambda f: _edit(f / "intri.yml", "20.", "0."), "intri.yml"),
     "aliases in intri": (
         lambda f: _edit(f / "intri.yml", "names:", f"a: &a [{'x,' * 9}]\nb: &b [{'*a,' * 9}]\nnames: [*b]\nc:"),
         "intri.yml: not an OpenCV YAML file (aliases",
     ),
     "key twice in intri": (lambda f: _edit(f / "intri.yml", "names:", "W_01: 12\nnames:"), "there twice"),
-    "names that are lists": (lambda f: _edit(f / "intri.yml", '"01"', '["01"]'), "intri.yml: camera name that is no"),
-    "name that is a terminal's command": (
+    "camera names that are lists": (
+        lambda f: _edit(f / "intri.yml", '"01"', '["01"]'),
+        "intri.yml: camera name that is no",
+    ),
+    "camera name with a terminal escape sequence": (
         lambda f: _edit(f / "intri.yml", '"01"', f'"\\e[2J{"a" * 500}"'),
         "intri.yml: camera name '\\x1b[2Jaaaa",
     ),
@@ -107,7 +110,7 @@ EASYMOCAP = {
     "matrix shorter than declared": (lambda f: _edit(f / "intri.yml", "cols: 3", "cols: 5"), "intri.yml: K_01"),
     "intri of a gigabyte": (lambda f: os.truncate(f / "intri.yml", 10**9), "intri.yml"),
     "camera name leaves the folder": (lambda f: _edit(f / "intri.yml", '"01"', '"../01"'), "intri.yml"),
-    "camera called as np.savez's argument": (_call_a_camera_file, "intri.yml: a camera cannot be"),
+    "camera named like an argument of np.savez": (_call_a_camera_file, "intri.yml: a camera cannot be"),
     "camera without a folder": (lambda f: (f / "images/02").rename(f / "images/03"), "images/02"),
     "camera without images": (
         lambda f: [p.unlink() for p in (f / "images/02").iterdir()],
@@ -117,7 +120,7 @@ EASYMOCAP = {
     "frame without a number": (lambda f: (f / "images/01/000001.png").rename(f / "images/01/a.png"), "images/01/a.png"),
     "unreadable image": (lambda f: (f / "images/01/000001.png").write_bytes(b"nothing"), "images/01/000001.png"),
     "image cut short": (lambda f: os.truncate(f / "images/01/000001.png", 700), "images/01/000001.png"),
-    "pictures that are all black": (
+    "all images are black": (
         lambda f: [write_image(p, np.full((16, 24, 3), 5, np.uint8)) for p in (f / "images/02").iterdir()],
         "images/02: all pictures are black",
     ),
@@ -162,20 +165,23 @@ EASYMOCAP = {
         lambda f: rec.write_keypoints(f / "openpose/01/000001_keypoints.json", [np.zeros((18, 3))]),
         "000001_keypoints.json",
     ),
-    "keypoint beyond all numbers": (
+    "keypoint with too many digits": (
         lambda f: _edit(f / "openpose/01/000001_keypoints.json", "4.0", "9" * 400),
         "000001_keypoints.json: keypoints are not triples of numbers",
     ),
-    "keypoints nested deeply": (
+    "keypoints are deeply nested": (
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text("[" * 100_000),
         "000001_keypoints.json",
     ),
-    "keypoints in shares of the picture": (_scale_keypoints(0.1), "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to"),
-    "keypoints in shares of the picture, one below its border": (
+    "keypoints as fractions of the image size": (
+        _scale_keypoints(0.1),
+        "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to",
+    ),
+    "keypoints as fractions of the image size, one below the border": (
         lambda f: [_scale_keypoints(0.1)(f), _edit(f / "openpose/01/000001_keypoints.json", "0.5", "1.02")],
         "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to 1.02 are not in the pixels",
     ),
-    "keypoints of larger pictures": (_scale_keypoints(4), "not in the pixels of pictures of 24 x 16"),
+    "keypoints of larger images": (_scale_keypoints(4), "not in the pixels of pictures of 24 x 16"),
     "keypoint whose mean with another overflows": (_far_shoulder, "000001_keypoints.json: a keypoint is beyond 1e+06"),
     "NaN keypoint": (_nan_keypoint, "000001_keypoints.json"),
     "a thousand people": (
@@ -198,10 +204,13 @@ EASYMOCAP = {
     "pipe in place of an image": (lambda f: _pipe(f / "images/01/000001.png"), "000001.png: is a pipe or a device"),
     "toml with a key of many parts": (_toml("a." * 20_000 + "b = 1\n"), "capture.toml: a key has more than 16 parts"),
     "toml beyond 64 KiB": (_toml("# " + "a" * 70_000), "capture.toml: 70002 bytes are too many"),
-    "toml with an endless integer": (_toml("fps = " + "9" * 5000), "capture.toml: is not TOML (Exceeds the limit"),
-    "toml with a huge integer": (_toml("fps = " + "9" * 4000), "capture.toml: fps"),
-    "toml with next to no frames": (_toml("fps = 1e-300"), "capture.toml: fps"),
-    "toml with next to no units": (_toml("units = 1e-300"), "capture.toml: units"),
+    "toml with an integer of 5000 digits": (
+        _toml("fps = " + "9" * 5000),
+        "capture.toml: is not TOML (Exceeds the limit",
+    ),
+    "toml with an integer of 4000 digits": (_toml("fps = " + "9" * 4000), "capture.toml: fps"),
+    "toml with a frame rate near zero": (_toml("fps = 1e-300"), "capture.toml: fps"),
+    "toml with a unit near zero": (_toml("units = 1e-300"), "capture.toml: units"),
     "toml is not TOML": (_toml("name = "), "capture.toml"),
     "toml with an unknown key": (_toml('[cameras]\ntrain = ["01"]\nvalidation = ["02"]\n'), "cameras.validation"),
     "toml with cameras outside their table": (
@@ -214,7 +223,7 @@ EASYMOCAP = {
     "toml with a mistyped key": (_toml('unit = "mm"\n'), "unit has no meaning; did you mean units?"),
     "toml in another encoding": (lambda f: (f / "capture.toml").write_bytes(b'name = "J\xfcrgen"'), "is not UTF-8"),
     "toml name too long for a folder": (_toml(f'name = "{100 * "张"}"\n'), "name of 300 bytes"),
-    "toml with endless units": (_toml("units = inf\n"), 'units: give "m", "mm", or a number'),
+    "toml with an infinite unit": (_toml("units = inf\n"), 'units: give "m", "mm", or a number'),
     "toml with an unknown camera": (_toml('[cameras]\ntrain = ["01", "07"]\n'), "camera 07"),
     "toml with a camera twice": (_toml('[cameras]\ntrain = ["01"]\ntest = ["01"]\n'), "named twice"),
     "toml with an unknown frame": (_toml("[frames]\ntrain = [0, 5]\n"), "frame 5"),
@@ -223,7 +232,7 @@ EASYMOCAP = {
         _toml('subject = "nearest (1, 2)"\n'),
         'subject: write "near',
     ),
-    "toml with a subject at the end of the world": (
+    "toml with a subject too far away": (
         _toml(f'subject = "nearest to ({"9" * 400}, 1)"\n'),
         'subject: write "near',
     ),
@@ -231,11 +240,14 @@ EASYMOCAP = {
         _toml('subject = "nearest to (1, 2) in 01 at frame 999"\n'),
         "capture.toml: subject: frame 999 is none of the recording's frames 0 to 4; correct it",
     ),
-    "toml with a subject beyond what the lens pictures": (
+    "toml with a subject beyond what the lens can image": (
         lambda f: [rec.write_calibration(f, (-0.3, 0, 0, 0)), _toml('subject = "nearest to (31, 7) in 01"\n')(f)],
         "capture.toml: subject: (31.0, 7.0) is beyond the lens of camera 01; correct it",
     ),
-    "toml with a subject in no camera": (_toml('subject = "nearest to (1, 2) in 07"\n'), "no training camera 07"),
+    "toml with a subject in an unknown camera": (
+        _toml('subject = "nearest to (1, 2) in 07"\n'),
+        "no training camera 07",
+    ),
     "toml with an impossible field of view": (_toml("field_of_view_deg = 200\n"), "field_of_view_deg"),
     "toml name leaves the store": (_toml('name = "../../other"\n'), "name '../../other'"),
 }
@@ -251,7 +263,7 @@ POSE2SIM = {
         lambda f: _edit(f / "calibration/Calib.toml", "rotation", "rot"),
         "Calib.toml: camera cam01: 'rotation'",
     ),
-    "camera is no table": (
+    "camera is not a table": (
         lambda f: _edit(f / "calibration/Calib.toml", "[cam01]", "cam03 = 1\n[cam01]"),
         "camera cam03",
     ),
@@ -265,8 +277,8 @@ POSE2SIM = {
         lambda f: shutil.copy(f / "videos/cam02.mp4", f / "videos/cam02.MOV"),
         "videos/cam02.mp4: camera cam02 is also cam02.MOV; keep one of them",
     ),
-    "video is none": (lambda f: (f / "videos/cam02.mp4").write_bytes(b"0" * 100), "videos/cam02.mp4"),
-    "video is a list of other files": (
+    "video is not a video": (lambda f: (f / "videos/cam02.mp4").write_bytes(b"0" * 100), "videos/cam02.mp4"),
+    "video is a playlist of other files": (
         lambda f: [
             (f / "videos/cam02.mp4").rename(f / "videos/cam02"),
             (f / "videos/cam02.mp4").write_text("ffconcat version 1.0\nfile cam02\nduration 0.4\n"),

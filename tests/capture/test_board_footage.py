@@ -140,7 +140,7 @@ def test_the_table_of_timestamps_reveals_dropped_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "message"),
     [(f"{'1' * 200_000},0\n", r"not a table \(field larger"), ("1,1\n" * 500_000, "2000018 bytes are too many")],
-    ids=["an endless field", "more than 2 MB"],
+    ids=["an overlong field", "more than 2 MB"],
 )
 def test_an_oversized_table_of_timestamps_is_refused(rows: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)

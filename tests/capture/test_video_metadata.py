@@ -6,10 +6,10 @@ import pytest
 from hnerf.capture.video_metadata import focal_35mm
 
 HOSTILE = {
-    "no image": ("a.jpg", b"nothing"),
+    "not an image": ("a.jpg", b"nothing"),
     "an empty image": ("a.png", b""),
-    "a box without end": ("a.mp4", struct.pack(">I4sQ", 1, b"free", 2**64 - 1)),
-    "a box that is smaller than its head": ("a.mp4", struct.pack(">I4s", 3, b"free")),
+    "a box of 2^64 - 1 bytes": ("a.mp4", struct.pack(">I4sQ", 1, b"free", 2**64 - 1)),
+    "a box that is smaller than its header": ("a.mp4", struct.pack(">I4s", 3, b"free")),
     "a box cut short": ("a.mp4", b"\x00\x00\x00\x01moov\x00"),
 }
 

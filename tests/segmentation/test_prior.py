@@ -23,7 +23,7 @@ HIPS = [8, 9, 12]
 @pytest.mark.parametrize(
     ("cameras", "unseen", "after"),
     [(2, HEAD, 0), (2, HEAD, 1), (1, HEAD, 0), (1, LEGS, 0), (2, FEET, 0), (1, HIPS, 0)],
-    ids=["head by one camera of two", "head later on", "head by the only camera", "legs", "feet", "hips"],
+    ids=["head in one camera of two", "head later on", "head in the only camera", "legs", "feet", "hips"],
 )
 def test_body_parts_without_keypoints_are_within_reach(
     tmp_path: Path, cameras: int, unseen: list[int], after: int

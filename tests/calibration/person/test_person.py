@@ -166,17 +166,17 @@ def test_poses_follow_outlines_before_scaling_and_grounding(tmp_path: Path, monk
 
 def test_the_frame_interval_follows_from_rate_and_stride(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every third frame at 60 frames a second: 50 ms apart."""
-    truth, asked = ring(3), []
+    truth, intervals_s = ring(3), []
     capture = write_capture(tmp_path, [without_pose(camera) for camera in truth], detections(truth, 1.0))
     capture = dataclasses.replace(capture, fps=60.0, train_frames=tuple(range(0, 36, 3)))
 
     def stood(cameras: list[Camera], points_m: np.ndarray, frame_s: float) -> tuple[list[Camera], np.ndarray, float]:
-        asked.append(frame_s)
+        intervals_s.append(frame_s)
         return stand_on_ground(cameras, points_m, frame_s)
 
     monkeypatch.setattr("hnerf.calibration.person.calibrate.stand_on_ground", stood)
     calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M)
-    assert asked == [pytest.approx(0.05)]
+    assert intervals_s == [pytest.approx(0.05)]
 
 
 def test_without_a_height_the_mean_is_used_and_reported(tmp_path: Path) -> None:
@@ -230,8 +230,8 @@ def test_cameras_that_look_along_one_line_are_refused(tmp_path: Path) -> None:
 def test_cameras_in_one_line_cannot_find_the_focal_length(count: int, tmp_path: Path) -> None:
     """Two cameras are always in one line."""
     line = [look_at(f"c{i}", np.array([3.5, 2.0 * i - 2, 1.2]), np.array([0, 0, 0.9])) for i in range(count)]
-    said = refusal(tmp_path, line, detections(line, 1.0), [camera.name for camera in line])
-    assert "one line" in said and said.endswith("give it (--fov or --lens), or add a camera beside that line")
+    message = refusal(tmp_path, line, detections(line, 1.0), [camera.name for camera in line])
+    assert "one line" in message and message.endswith("give it (--fov or --lens), or add a camera beside that line")
 
 
 def test_too_few_shared_keypoints_are_refused(tmp_path: Path) -> None:

@@ -219,5 +219,5 @@ def test_the_command_line_exports_cameras(tmp_path: Path, capsys: pytest.Capture
     assert main(["export-cameras", str(folder), "--format", "aniposelib", "--out", str(tmp_path / "out")]) == 0
     assert Caliscope(tmp_path / "out").lenses()["01"].t_m.tolist() == pytest.approx([0.001, 0.002, 0.003])
     assert main(["calibrate", str(folder), "--out", str(tmp_path / "none")]) == 2
-    told = capsys.readouterr().err
-    assert "no board footage" in told and "--from person" in told and not (tmp_path / "none").exists()
+    stderr = capsys.readouterr().err
+    assert "no board footage" in stderr and "--from person" in stderr and not (tmp_path / "none").exists()
