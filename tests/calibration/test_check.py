@@ -332,7 +332,7 @@ def test_a_rendered_capture_is_left_unchanged(wave: Capture) -> None:
 
 
 def test_the_trimmed_cost_uses_every_view() -> None:
-    """One camera looks backwards. If it were rejected, the cost would be its image's diagonal alone: 354 px in all."""
+    """One camera looks backwards. Rejecting it would cost a quarter of its image's diagonal, 354 px, and no more."""
     cameras = ring(4)
     keypoints = np.stack([found[:, 0] for found in detections(cameras, 0).values()]).reshape(4, -1, 3)
     assert trimmed_cost_px(cameras, keypoints) == pytest.approx(0, abs=1e-6)

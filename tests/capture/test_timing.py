@@ -66,19 +66,19 @@ def test_a_synchronised_capture_reads_the_nearest_frames(tmp_path: Path) -> None
     size = {"a": (4, 4)}
     capture = Capture("x", tmp_path, {"a": camera}, ("a",), (), (0, 1, 2, 3), (4, 5), 30.0, "z", size, size)
 
-    in_step = capture.synchronised({"a": 1.75})  # instants 0 .. 3 lie nearest to frames 2 .. 5; 4 and 5 are beyond
-    assert (in_step.train_frames, in_step.novel_pose_frames) == ((0, 1, 2, 3), ())
-    assert in_step.image("a", 1).max() == 120
-    assert [in_step.given_mask("a", frame).all() for frame in in_step.frames] == [False, False, True, False]  # type: ignore[union-attr]
-    found = in_step.keypoints("a")
+    shifted = capture.synchronised({"a": 1.75})  # instants 0 .. 3 lie nearest to frames 2 .. 5; 4 and 5 are beyond
+    assert (shifted.train_frames, shifted.novel_pose_frames) == ((0, 1, 2, 3), ())
+    assert shifted.image("a", 1).max() == 120
+    assert [shifted.given_mask("a", frame).all() for frame in shifted.frames] == [False, False, True, False]  # type: ignore[union-attr]
+    found = shifted.keypoints("a")
     assert found is not None
     np.testing.assert_allclose(found[:, 0, 0, 0], [17.5, 27.5, 37.5, 47.5])
 
-    hands = in_step.hands("a")  # the right hand moves by nearly its own length per frame
+    hands = shifted.hands("a")  # the right hand moves by nearly its own length per frame
     assert hands is not None
     np.testing.assert_allclose(hands[:, :, 0, 0], [[0, x] for x in (157.5, 247.5, 337.5, 427.5)])
 
-    in_step.save()
+    shifted.save()
     assert json.loads((tmp_path / "capture.json").read_text())["frame_offsets"] == {"a": 1.75}
     again = Capture.load(tmp_path)
     assert (again.frame_offsets, again.stored_frames, again.frames) == ({"a": 1.75}, (0, 1, 2, 3, 4, 5), (0, 1, 2, 3))

@@ -175,7 +175,7 @@ def test_poses_are_selected_by_frame() -> None:
 
 
 def test_poses_of_a_long_motion_are_selected_in_one_pass() -> None:
-    """Searching all frames for each would compare 200 * 199 / 2 pairs; a dictionary finds identical ones without."""
+    """Searching all frames for each would compare 200 * 199 / 2 pairs; a dictionary compares no identical frames."""
     compared = []
 
     class Frame(int):

@@ -206,7 +206,7 @@ def test_the_offset_of_echoing_sound_is_found_within_two_milliseconds(kind: str)
 
 
 def test_long_recordings_of_sound_fit_into_memory() -> None:
-    """In single precision, and with few copies: two recordings of 40 minutes need 3 GB."""
+    """With single precision and few copies, two recordings of 40 minutes need 3 GB."""
     rng = np.random.default_rng(2)
     a = rng.normal(size=520_000).astype(np.float32)
     b = np.roll(a, 5_000) + rng.normal(size=len(a)).astype(np.float32)

@@ -122,7 +122,7 @@ def test_a_leaning_person_does_not_tilt_level_cameras() -> None:
 
 
 def test_frames_within_a_step_count_as_one_at_any_rate() -> None:
-    """Repeating every frame at twice the rate changes nothing. Half a second between frames counts like a whole one."""
+    """Doubling both frames and rate changes nothing. Frames half a second apart count as much as a second apart."""
     rolled = [dataclasses.replace(c, R=cv2.Rodrigues(np.array([0, 0, 0.1]))[0] @ c.R) for c in ring(4)]
     walk = walk_m() + np.random.default_rng(0).normal(0, 0.01, (12, 25, 3))
     once, twice, slow, slower = (
