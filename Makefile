@@ -1,4 +1,5 @@
-# make install | test | faults | soak | demo | docs.  pip's own environment variables choose another index, for example for CUDA wheels.
+# make install | test | faults | soak | demo | docs
+# To use another package index, for example for CUDA wheels, set pip's environment variables.
 export DO_NOT_TRACK := 1
 
 PYTHON ?= python3
@@ -10,7 +11,7 @@ SUBJECTS ?= 6
 
 install: $(INSTALLED)
 
-# torch first and by its exact version: a resolver left to itself may fetch several builds of it.
+# Install torch first, at its pinned version: otherwise pip's resolver may download several builds of it.
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt torch
@@ -20,8 +21,8 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/hnerf models || echo "warning: no networks; what needs them says so (hnerf models)" >&2
 	touch $@
 
-# Tests start many processes of the same code, which without bytecode would compile it each time; some wait for them, so
-# that three workers keep two cores busy.
+# Keep bytecode: tests start many processes, each of which would otherwise compile the same code again. Some tests only
+# wait for these processes, so three workers keep two cores busy.
 test: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check --quiet .

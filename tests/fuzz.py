@@ -1,10 +1,10 @@
-"""Damage small captures of every layout, and other files that strangers hand over, at random, and read them:
+"""Damage small captures of every layout, and other untrusted files, at random, and read them:
 
     python tests/fuzz.py [--cases 10000] [--seed 0] [--seconds 60]
     python tests/fuzz.py --case 1234                    # one case again, with its traceback
 
-A case is good if the file is read, or refused by an InputError; in at most two seconds and 500 MB. Anything else is a
-failure: another exception, a crash of the process, a hang. The exit status is 1 if there is one.
+A case passes if the file is read, or refused with an InputError, in at most two seconds and 500 MB. Anything else is a
+failure: another exception, a crash of the process, a hang. The exit status is 1 if there was a failure.
 """
 
 import argparse
@@ -50,16 +50,16 @@ from tests.capture.formats.test_peoplesnapshot import write_peoplesnapshot
 from tests.capture.formats.test_zjumocap import write_parameters, write_zju
 
 MAX_SECONDS, MAX_MIB, HANG_S = 2.0, 477, 20.0
-ROOM_BYTES = 3_000_000_000  # more than MAX_MIB, because most of what libraries map they never use
-START_S = 60.0  # of a process, on a busy machine
+ROOM_BYTES = 3_000_000_000  # more than MAX_MIB: libraries map much memory that they never use
+START_S = 60.0  # for a process to start on a busy machine
 FRAMES = 2
 
-Read = Callable[[Path, Path], object]  # a folder, and an empty one for results
+Read = Callable[[Path, Path], object]  # arguments: the folder to read, and an empty one for results
 
 
 @dataclass(frozen=True)
 class Reader:
-    """Something that reads files of strangers. write: fills an empty folder with sound files; read: reads it."""
+    """Code that reads untrusted files. write: fill an empty folder with valid files; read: read that folder."""
 
     name: str
     write: Callable[[Path], object]
@@ -71,7 +71,7 @@ def _ingest(folder: Path, out: Path) -> object:
 
 
 def _photograph(path: Path, rgb: np.ndarray) -> None:
-    """Write a JPEG as a phone held upright does, whose EXIF says how to turn it."""
+    """Write a JPEG like one from a phone held upright: stored rotated, with the orientation in its EXIF."""
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Make] = 6, "phone"
     exif[ExifTags.Base.XResolution], exif[ExifTags.IFD.Exif] = 72.0, {ExifTags.Base.FocalLengthIn35mmFilm: 26}
@@ -80,7 +80,7 @@ def _photograph(path: Path, rgb: np.ndarray) -> None:
 
 
 def _easymocap(folder: Path) -> None:
-    """Write what an EasyMocap folder can hold: masks, a plate, keypoints of both kinds, capture.toml."""
+    """Write a full EasyMocap folder: masks, background plates, keypoints of both kinds, capture.toml."""
     rec.write_calibration(folder, distortion=(0.1, 0, 0, 0, 0))
     for camera in rec.CAMERAS:
         for frame in range(FRAMES):
@@ -120,7 +120,7 @@ def _colmap_binary(folder: Path) -> None:
 
 
 def _boards(folder: Path) -> None:
-    """Write a recording with footage of a board, as Caliscope names it."""
+    """Write a recording with calibration-board footage, with Caliscope's file names."""
     _with_cameras("caliscope")(folder)
     for camera in ("cam_0", "cam_1"):
         for frame in range(FRAMES):
@@ -210,7 +210,7 @@ NUMBER = re.compile(rb"-?\d+(\.\d*)?(e[+-]?\d+)?")
 
 
 def damaged(data: bytes, others: list[bytes], rng: random.Random) -> tuple[str, bytes]:
-    """Return what was done to a file's bytes, and the result. others: the bytes of other files."""
+    """Damage a file's bytes; return the kind of damage and the new bytes. others: the contents of other files."""
     at, length = rng.randrange(len(data) + 1), rng.choice((1, 2, 4, 8, 64, 1024))
     token = rng.choice(TOKENS)
     numbers = [found.span() for found in NUMBER.finditer(data[:20_000])] or [(at, at)]
@@ -235,7 +235,7 @@ def damaged(data: bytes, others: list[bytes], rng: random.Random) -> tuple[str, 
 
 
 def replace(path: Path, rng: random.Random) -> str:
-    """Put something that is no file into a file's place; return what was done."""
+    """Remove a file or put something other than a regular file in its place; return what was done."""
     path.unlink()
     done = rng.choice(("missing", "a folder", "a pipe", "a link", "a device"))
     if done == "a folder":
@@ -248,24 +248,24 @@ def replace(path: Path, rng: random.Random) -> str:
 
 
 class Workshop:
-    """Sound folders of all readers, one of which is damaged at a time."""
+    """Valid folders for all readers; each case damages one file in one of them, and restores it."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (mapped + ROOM_BYTES,) * 2)  # a MemoryError, not a machine that swaps
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + ROOM_BYTES,) * 2)  # raise MemoryError before the machine swaps
         logging.disable(logging.CRITICAL)
         for reader in READERS:
             (root / reader.name).mkdir()
             reader.write(root / reader.name)
         self.files = {r.name: sorted(p for p in (root / r.name).rglob("*") if p.is_file()) for r in READERS}
-        for reader in READERS:  # sound, they are read
+        for reader in READERS:  # undamaged folders must be readable
             reader.read(root / reader.name, root / "out")
             shutil.rmtree(root / "out", ignore_errors=True)
         self.content = {path: path.read_bytes() for paths in self.files.values() for path in paths}
 
     def try_case(self, seed: int, case: int) -> tuple[str, str | None]:
-        """Return what a case was, and its failure in words or None."""
+        """Run a case; return its description, and a description of its failure or None."""
         rng = random.Random(f"{seed} {case}")
         reader = READERS[case % len(READERS)]
         path = rng.choice(self.files[reader.name])
@@ -303,7 +303,7 @@ class Workshop:
 
 
 def _work(root: Path, seed: int, cases: range, results: multiprocessing.connection.Connection) -> None:
-    """Try cases, and send each before and after it is tried."""
+    """Run cases; report each one before and after it runs."""
     workshop = Workshop(root)
     for case in cases:
         results.send((case, None, None))
@@ -313,15 +313,15 @@ def _work(root: Path, seed: int, cases: range, results: multiprocessing.connecti
 
 @dataclass(frozen=True)
 class Outcome:
-    """How many cases were tried, and the failures in words."""
+    """The number of cases that ran, and descriptions of the failures."""
 
     cases: int
     failures: list[str]
 
 
 def fuzz(cases: int, seed: int = 0, seconds: float = float("inf")) -> Outcome:
-    """Try cases in a process of their own, until there are enough or the time is over. A crash or a hang is a failure
-    of the case that was tried, and the next process begins after it."""
+    """Run cases in a child process until there are enough or the time is up. A crash or a hang is a failure of the case
+    that was running; a new process continues with the next case."""
     began, failures, case, tried = time.monotonic(), [], 0, 0
     spawn = multiprocessing.get_context("spawn")
     while case < cases and time.monotonic() - began < seconds:
@@ -351,7 +351,7 @@ def fuzz(cases: int, seed: int = 0, seconds: float = float("inf")) -> Outcome:
 
 
 def main() -> int:
-    """Try what is asked for; the exit status."""
+    """Run the requested cases; return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)

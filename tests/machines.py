@@ -1,4 +1,4 @@
-"""Processes of a soak, and pretended machines: each has a worker whose store lies on a disk of its own."""
+"""Processes of the soak test, and simulated machines: each is a worker whose store is on its own disk."""
 
 import os
 import random
@@ -13,8 +13,8 @@ from pathlib import Path
 from uuid import uuid4
 
 ROOT = Path(__file__).parents[1]
-MARK = "HNERF_SOAK"  # in the environment of every process that is started here
-# In a mount namespace of its own, where the second folder shows the first.
+MARK = "HNERF_SOAK"  # an environment variable of every process that is started here
+# Run a command in a mount namespace of its own, in which the first folder is mounted on the second.
 WITH_DISK = (
     "unshare",
     "--map-root-user",
@@ -26,13 +26,13 @@ WITH_DISK = (
 )
 WORKER = ("prefect", "worker", "start", "--pool", "local", "--type", "process", "--limit", "2")
 FLOW_RUN = ("prefect.flow_engine", "prefect.engine")
-DELAY_S = 20.0  # before a run is killed, at most
+DELAY_S = 20.0  # the longest wait before a run is killed
 STOP_S = 90.0  # TimeoutStopSec of flows/systemd_units.py
 
 
 @dataclass
 class Machine:
-    """A worker, and what is on its disk."""
+    """A worker and its disk."""
 
     scratch: Path
     number: int
@@ -56,11 +56,11 @@ class Machine:
 
     @property
     def disk(self) -> Path:
-        """Return what this machine has for a store."""
+        """Return the folder that holds this machine's store."""
         return self.scratch / f"disk{self.number}"
 
     def run(self) -> int | None:
-        """Return the process of some run that the worker started, after a random while in it."""
+        """Wait for a random time; return the process of some run of this worker that is still alive, or None."""
         runs = [pid for pid in descendants(self.worker.pid) if any(name in command(pid) for name in FLOW_RUN)]
         if not runs:
             return None
@@ -69,20 +69,20 @@ class Machine:
         return random.choice(alive) if alive else None
 
     def restarted(self) -> "Machine":
-        """Start the worker again if it has ended, as systemd does, which first ends what it had started."""
+        """Restart the worker if it has ended. As systemd does, first end the processes that it had started."""
         if self.worker.poll() is None:
             return self
         self._end()
         return Machine._with_disk(self.scratch, self.number)
 
     def lose(self) -> "Machine":
-        """Kill all that runs here, and lose the disk; return the machine that comes in its place."""
+        """Kill all processes of this machine and lose its disk; return an empty machine that replaces it."""
         self._end()
         os.replace(self.disk, self.scratch / f"lost-{uuid4().hex}")
         return Machine.started(self.scratch, self.number)
 
     def stop(self) -> None:
-        """Stop the worker as systemd does: with patience, and then with all that it started."""
+        """Stop the worker as systemd does: wait for it to end, then kill whatever it had started."""
         self.worker.terminate()
         with suppress(subprocess.TimeoutExpired):
             self.worker.wait(timeout=STOP_S)
@@ -96,7 +96,7 @@ class Machine:
 
 
 def start(scratch: Path, name: str, *command: str, home: str = "prefect") -> "subprocess.Popen[bytes]":
-    """Start a command whose output goes into a file, with a home of Prefect's of its own."""
+    """Start a command with its own Prefect home; its output goes into a log file."""
     environment = os.environ | {"PREFECT_HOME": str(scratch / home)}
     with (scratch / f"{name}.log").open("ab") as log:
         return subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log, env=environment)
@@ -104,7 +104,7 @@ def start(scratch: Path, name: str, *command: str, home: str = "prefect") -> "su
 
 @contextmanager
 def process(scratch: Path, name: str, *arguments: str) -> Iterator["subprocess.Popen[bytes]"]:
-    """Run a module of Python as long as the block lasts."""
+    """Run a Python module until the block ends."""
     started = start(scratch, name, sys.executable, "-m", *arguments)
     try:
         yield started
@@ -114,7 +114,7 @@ def process(scratch: Path, name: str, *arguments: str) -> Iterator["subprocess.P
 
 
 def marked(variable: str) -> list[int]:
-    """Return the processes, other than this one, in whose environment this stands."""
+    """Return the other processes that have this `NAME=value` in their environment."""
     found = []
     for path in Path("/proc").glob("[0-9]*/environ"):
         try:
@@ -147,6 +147,6 @@ def command(pid: int) -> str:
 
 
 def resident_kib(pid: int) -> int:
-    """Return the memory that a process holds."""
+    """Return the resident memory of a process."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))

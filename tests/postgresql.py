@@ -1,4 +1,4 @@
-"""A PostgreSQL of Debian's for a test, which starts empty and goes with it."""
+"""A PostgreSQL server (Debian's) for one test: it starts empty, and is removed afterwards."""
 
 import os
 import shutil
@@ -16,8 +16,8 @@ BINARIES = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: in
 
 @contextmanager
 def cluster() -> Iterator[dict[str, str]]:
-    """Start an empty PostgreSQL; yield the environment in which its administrator's commands run."""
-    folder = Path(tempfile.mkdtemp(prefix="hnerf-postgresql-"))  # which the user postgres can reach
+    """Start an empty PostgreSQL; yield the environment for its administrator's commands."""
+    folder = Path(tempfile.mkdtemp(prefix="hnerf-postgresql-"))  # which the user postgres can read
     as_postgres = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if os.getuid() == 0 else []
     if as_postgres:
         shutil.chown(folder, "postgres")

@@ -1,4 +1,4 @@
-"""A Prefect server of the tests' own, with its scheduler (the test harness of Prefect schedules nothing)."""
+"""A Prefect server for tests, with its scheduler (Prefect's own test harness schedules nothing)."""
 
 import socket
 import subprocess
@@ -13,7 +13,7 @@ import pytest
 
 
 def free_port() -> int:
-    """Return a port of this machine that nobody listens on."""
+    """Return an unused port of this machine."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return int(free.getsockname()[1])
@@ -23,7 +23,7 @@ def free_port() -> int:
 def prefect_server(
     patience_s: float = 120.0, environment: Mapping[str, str] | None = None, folder: Path | None = None
 ) -> Iterator[str]:
-    """Run a server, and yield the URL of its API once it answers."""
+    """Run a server; yield the URL of its API once it answers."""
     port = free_port()
     url = f"http://127.0.0.1:{port}/api"
     where = ("--host", "127.0.0.1", "--port", str(port))

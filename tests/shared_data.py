@@ -1,4 +1,4 @@
-"""Where the shared captures lie, if this checkout has them beside it."""
+"""The shared captures, if they are next to this checkout."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ SHARED_DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 
 
 def shared_capture(name: str) -> Path:
-    """The folder of a shared capture; skips the test where it is absent."""
+    """Return the folder of a shared capture; skip the test if it is absent."""
     path = SHARED_DATA / name
     if not path.exists():
         pytest.skip(f"shared capture {name} is not beside this checkout")

@@ -1,13 +1,13 @@
-"""Many small recordings through server, schedule, two workers and a bucket, while processes are killed now and then:
+"""Train many small recordings through a server, a schedule, two workers and a bucket, while processes are killed:
 
     python tests/soak.py [--subjects 6] [--kill-every 120]
 
-Recordings lie in the bucket; all else happens in a folder of its own. The workers are machines with separate stores
-(tests/machines.py), which share artifacts through moto's server of S3. Kills alternate: the process of a run, with its
-worker alive; and a machine with all that it has started and its disk, in whose place an empty one comes. In the end
-every recording must have had its results, the bucket must hold them, every artifact must have been put there once,
-stores must verify clean, a third machine must get all from the bucket, and no process may be left. The exit status says
-so.
+The recordings are in the bucket; everything else is in a temporary folder. The workers are simulated machines with
+separate stores (tests/machines.py), which share artifacts through moto's S3 server. Kills alternate between two kinds:
+the process of a run, whose worker stays alive; and a whole machine with its processes and its disk, which an empty
+machine replaces. In the end, every recording must have its results, the bucket must hold them, every artifact must have
+been put there exactly once, the stores must verify clean, a third machine must get everything from the bucket, and no
+process may be left. The exit status is 1 if one of these conditions fails.
 """
 
 import argparse
@@ -50,7 +50,7 @@ LIMIT_S = 6 * 3600.0
 
 
 def main() -> int:
-    """Run what the command line says; return the exit status."""
+    """Run the soak test with the options of the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=6)
     parser.add_argument("--kill-every", type=float, default=120.0, metavar="S")
@@ -62,7 +62,7 @@ def main() -> int:
 
 
 def under_fire(subjects: int, kill_every_s: float, limit_s: float = LIMIT_S) -> dict[str, Any]:
-    """Train recordings under fire in a new folder, which is removed unless there were faults; return the figures."""
+    """Run the soak test in a new folder, which is kept only if there were faults; return the figures."""
     scratch = Path(tempfile.mkdtemp(prefix="hnerf-soak-"))
     mark = uuid4().hex
     server_port, bucket_port = free_port(), free_port()
@@ -96,8 +96,8 @@ def under_fire(subjects: int, kill_every_s: float, limit_s: float = LIMIT_S) -> 
 def soak(
     scratch: Path, ports: tuple[int, int], mark: str, subjects: int, kill_every_s: float, limit_s: float
 ) -> dict[str, Any]:
-    """Train all recordings in a folder, with a server and a bucket at these ports; return the figures, among which are
-    the faults."""
+    """Train all recordings in a folder, with a server and a bucket at these ports; return the figures, including the
+    faults."""
     server_port, bucket_port = ports
     names = write_captures(scratch / "captures", subjects)
     (scratch / "preset.yaml").write_text(PRESET)
@@ -122,7 +122,7 @@ def soak(
             if time.monotonic() < kill_s:
                 continue
             kill_s = time.monotonic() + kill_every_s * random.uniform(0.5, 1.5)
-            if run := machines[at].run():  # a kill that finds none lapses: it would meet the last run as it begins
+            if run := machines[at].run():  # without a run, skip it; later it would hit the last run
                 if kills.total() % 2:
                     machines[at] = machines[at].lose()
                 else:
@@ -162,8 +162,8 @@ def soak(
 
 @contextmanager
 def database() -> Iterator[None]:
-    """Have the server use a PostgreSQL of its own, where one is installed, in place of SQLite, which two workers of a
-    busy machine make wait for minutes."""
+    """Give the server a PostgreSQL of its own, if one is installed. On SQLite, two workers of a busy machine can make it
+    wait for minutes."""
     if not BINARIES:
         yield
         return
@@ -187,8 +187,8 @@ def write_captures(folder: Path, count: int) -> list[str]:
 
 
 def set_up(scratch: Path) -> None:
-    """Put the recordings into a new bucket; make work pool, deployments, automations, and a schedule that looks there
-    all the time."""
+    """Put the recordings into a new bucket; make the work pool, the deployments, the automations, and a schedule that
+    looks into the bucket every LOOK_S."""
     from fsspec import filesystem
     from prefect import get_client
     from prefect.client.schemas.actions import DeploymentScheduleCreate, DeploymentUpdate
@@ -215,7 +215,7 @@ def set_up(scratch: Path) -> None:
 
 
 def note_finished(scratch: Path, names: list[str], done: dict[str, list[str]]) -> None:
-    """Note the people who have an asset and a report on some machine, or on the disk of a lost one, and the names of
+    """Add to `done` each subject that has an asset and a report on some machine or on a lost disk, with the names of
     these artifacts."""
     for name in names:
         for links in scratch.glob(f"*/subjects/{name}"):
@@ -224,13 +224,13 @@ def note_finished(scratch: Path, names: list[str], done: dict[str, list[str]]) -
 
 
 def shared_artifacts(scratch: Path) -> Counter[str]:
-    """Return how often each artifact was put into the bucket, by the log of its server."""
+    """Return how often each artifact was put into the bucket, counted in the log of its server."""
     log = (scratch / "s3.log").read_text(errors="replace")
     return Counter(re.findall(rf'"PUT /{BUCKET}/shared/(\S+)\.tar HTTP/[0-9.]+" 200', log))
 
 
 def wait_until_idle(patience_s: float = 180.0) -> None:
-    """Wait until no run is running any more; the results are all there."""
+    """Wait until no run is running; call this once all results exist."""
     deadline_s = time.monotonic() + patience_s
     while time.monotonic() < deadline_s and run_states().get("RUNNING", 0):
         time.sleep(POLL_S)
@@ -248,7 +248,7 @@ def run_states() -> dict[str, int]:
 
 
 def verify(store: Path) -> list[str]:
-    """Return what is wrong in a store. What interrupted work left may stay where another machine went on."""
+    """Return the faults of a store. Leftovers of interrupted work are none: another machine may have resumed it."""
     from tasks.store import Store
     from tasks.verify import faults
 
@@ -256,7 +256,7 @@ def verify(store: Path) -> list[str]:
 
 
 def fetched(store: Path, names: list[str]) -> Path:
-    """Fetch these artifacts into the store of another machine, which must not compute any."""
+    """Fetch these artifacts into the store of another machine, which must not compute any; return the store."""
     from tasks.bucket import Bucket
     from tasks.shared import get_or_compute
     from tasks.store import Artifact, Store
@@ -271,7 +271,7 @@ def fetched(store: Path, names: list[str]) -> Path:
 
 
 def run(module: str, *arguments: str) -> None:
-    """Run a command to its end."""
+    """Run a Python module as a command; raise CalledProcessError if it fails."""
     subprocess.run([sys.executable, "-m", module, *arguments], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
 
 

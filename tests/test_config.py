@@ -21,7 +21,7 @@ def changes(folder: Path, text: str) -> Path:
 
 
 def test_changes_replace_what_they_name_and_nothing_else(tmp_path: Path) -> None:
-    """Values change at three depths, with a list that is replaced as a whole; all others are the preset's."""
+    """Values change at three depths, and a list is replaced as a whole; everything else keeps the preset's value."""
     full = load_settings("demo")
     text = "training: {steps: 7, losses: {mask: 0.5}, field: {colour_cells: [8]}}\nevaluation: {report_rows: 1}"
     found = with_changes(full, changes(tmp_path, text)).model_dump()
@@ -55,13 +55,13 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("training: {losses: {fog: 0.1}}", "training: fast does not model the background"),
     ],
 )
-def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: str, named: str) -> None:
+def test_invalid_settings_are_refused_with_file_and_key(tmp_path: Path, text: str, named: str) -> None:
     path = changes(tmp_path, text)
     with pytest.raises(InputError, match=f"{path}: {named}: "):
         with_changes(load_settings("fast"), path)
 
 
-def test_keys_that_contradict_each_other_are_one_line_with_one_advice() -> None:
+def test_an_error_of_contradicting_keys_is_one_line_with_one_advice() -> None:
     with pytest.raises(
         InputError, match=r"^a\.yaml: test_cameras: one at most between two training cameras; lower it$"
     ):
@@ -87,7 +87,7 @@ def test_keys_that_contradict_each_other_are_one_line_with_one_advice() -> None:
         lambda path: load_stability(str(path)),
     ],
 )
-def test_files_that_are_no_tables_are_one_line(
+def test_an_error_of_a_file_without_keys_is_one_line(
     load: Callable[[Path], Any], content: bytes, message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "mine.yaml"
@@ -96,7 +96,7 @@ def test_files_that_are_no_tables_are_one_line(
         load(path)
 
 
-def test_an_override_that_is_no_yaml_is_one_line() -> None:
+def test_an_error_of_an_override_that_is_not_yaml_is_one_line() -> None:
     with pytest.raises(InputError, match=r"^--set training\.steps=\[100: is not YAML [^\n]*; correct it$"):
         load_settings("fast", ["training.steps=[100"])
 
@@ -108,33 +108,33 @@ def test_an_override_that_is_no_yaml_is_one_line() -> None:
         ("(c) A: all # 3", "(c) A: all # 3"), ("@a [b", "@a [b"), ('"A: b"', "A: b"),
     ],
 )  # fmt: skip
-def test_text_that_reads_like_a_number_or_a_day_is_text(value: str, text: str) -> None:
+def test_text_settings_accept_values_that_look_like_numbers_or_dates(value: str, text: str) -> None:
     settings = load_settings("fast", [f"asset.version={value}", f"evaluation.holdout={value}"])
     assert (settings.asset.version, settings.evaluation.holdout) == (text, text)
     assert load_settings("fast", ["evaluation.holdout=null"]).evaluation.holdout is None
 
 
-def test_a_path_is_taken_as_it_is() -> None:
+def test_path_settings_are_not_parsed_as_yaml() -> None:
     settings = load_settings("fast", ["segmentation.model=/take #2/1: seg.onnx", "fit.body_model=2024"])
     assert (settings.segmentation.model, settings.fit.body_model) == (Path("/take #2/1: seg.onnx"), Path("2024"))
     assert load_settings("fast", ["segmentation.model=null"]).segmentation.model is None
     assert load_settings("fast", ["fit.body_model=anny"]).fit.body_model == "anny"
 
 
-def test_an_override_of_endless_depth_is_one_line() -> None:
+def test_an_error_of_a_very_deep_override_is_one_line() -> None:
     key = ".".join(["x"] * 3000)
     with pytest.raises(InputError, match=r"^--set x\.x.*no such key; `hnerf settings` lists them"):
         load_settings("fast", [f"{key}=1", f"{key}=2"])
 
 
-def test_a_field_without_its_kind_is_said(tmp_path: Path) -> None:
+def test_a_field_without_its_kind_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("training: {field: {samples: 5}}")
     with pytest.raises(InputError, match=rf"^{path}: training\.field: 'kind' is missing; add it$"):
         load_settings(str(path))
 
 
-def test_a_key_that_a_file_lacks_is_named(tmp_path: Path) -> None:
+def test_an_error_names_the_missing_key(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("methods: [fast]\nvariants: {all: {}}")
     with pytest.raises(InputError, match=rf"^{path}: title: is missing; add it$"):
@@ -154,7 +154,7 @@ def test_a_preset_builds_on_another(tmp_path: Path) -> None:
         load_settings(str(path))
 
 
-def test_a_preset_builds_on_one_that_builds_on_another(tmp_path: Path) -> None:
+def test_a_preset_can_build_on_a_preset_with_a_base(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("based_on: nerf-wide\ntraining: {field: {samples: 5}}")
     wide, mine = load_settings("nerf-wide").training, load_settings(str(path)).training
@@ -169,8 +169,8 @@ def test_a_preset_cannot_build_on_itself(tmp_path: Path) -> None:
         load_settings(str(one))
 
 
-def test_a_video_in_place_of_a_preset_is_not_read(tmp_path: Path) -> None:
-    """Neither as a preset nor as what one is based on."""
+def test_a_large_file_is_not_read_as_a_preset(tmp_path: Path) -> None:
+    """Neither as a preset, nor as the base of one. Files of more than 64 KiB are not read."""
     path = tmp_path / "large.yaml"
     path.write_bytes(b"#" * 65_537)
     (tmp_path / "mine.yaml").write_text(f"based_on: {path}")
@@ -190,29 +190,29 @@ def test_a_video_in_place_of_a_preset_is_not_read(tmp_path: Path) -> None:
         ("fit.body_model=null", "fit.body_model: "),
     ],
 )
-def test_errors_in_unions_name_the_key_as_it_is_set(override: str, message: str) -> None:
+def test_errors_in_unions_name_the_key_that_was_set(override: str, message: str) -> None:
     with pytest.raises(InputError, match=rf"^--set {re.escape(override)}: {re.escape(message)}"):
         load_settings("fast", [override])
 
 
-def test_another_kind_of_field_keeps_nothing_of_the_kind_before() -> None:
+def test_a_new_kind_of_field_starts_from_its_own_defaults() -> None:
     changed = load_settings("demo", ["training.pose_learning_rate=0", "training.field.kind=nerf"]).training
     assert changed.field == NerfSettings()
 
 
-def test_a_seed_is_one_that_torch_takes() -> None:
+def test_seeds_that_torch_does_not_accept_are_refused() -> None:
     torch.manual_seed(load_settings("fast", [f"training.seed={2**63 - 1}"]).training.seed)
     with pytest.raises(InputError, match=rf"^--set training\.seed={2**63}: training\.seed: Input should be less than"):
         load_settings("fast", [f"training.seed={2**63}"])
 
 
 @pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "fa/" * 2000])
-def test_a_name_that_no_file_can_have_is_no_preset(name: str) -> None:
+def test_an_impossible_file_name_is_not_a_preset(name: str) -> None:
     with pytest.raises(InputError, match="no such preset or file"):
         load_settings(name)
 
 
-def test_a_synthetic_capture_has_a_rate_that_the_reader_accepts() -> None:
+def test_synthetic_captures_have_frame_rates_that_the_reader_accepts() -> None:
     for fps in (MIN_FPS, MAX_FPS):
         assert SyntheticSettings(fps=fps).fps == fps
     for fps in (MIN_FPS / 2, 2 * MAX_FPS):

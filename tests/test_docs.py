@@ -1,4 +1,4 @@
-"""What the Markdown files point at is there: linked files and headings, paths of code, answers to "where is ...?"."""
+"""The Markdown files refer only to what exists: files, headings, paths of code, answers to "where is ...?"."""
 
 import re
 from pathlib import Path
@@ -20,7 +20,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_link_targets_exist(page: Path) -> None:
     for link in LINK.findall(page.read_text()):
         if "://" in link:
             continue
@@ -31,7 +31,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_code_that_is_named_is_there(page: Path) -> None:
+def test_named_code_exists(page: Path) -> None:
     text = page.read_text()
     for path in CODE.findall(text):
         assert (ROOT / path).exists(), f"{page.name}: {path}"
@@ -43,7 +43,7 @@ def test_code_that_is_named_is_there(page: Path) -> None:
         assert found or (inside.exists() and re.search(rf"\b{last}", inside.read_text())), f"{page.name}: hnerf{name}"
 
 
-def test_where_is_what() -> None:
+def test_answers_to_where_is_name_existing_code() -> None:
     answers = ANSWER.findall((ROOT / "CONTRIBUTING.md").read_text())
     assert len(answers) >= 12
     for path, name in answers:

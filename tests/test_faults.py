@@ -1,4 +1,4 @@
-"""The fault program on a code of one line; and that its own faults can still be put in."""
+"""The fault program, on code of one line; and that its own faults can still be inserted."""
 
 import subprocess
 import sys
@@ -10,8 +10,8 @@ from tests.faults import FAULTS, ROOT, Fault, judge, with_fault
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=[fault.name for fault in FAULTS])
-def test_a_fault_can_be_put_in(fault: Fault) -> None:
-    """Its text is there exactly once, and its file is still one that Python reads; its tests are there."""
+def test_every_fault_can_be_inserted(fault: Fault) -> None:
+    """Its text is found exactly once, the changed file still compiles, and its tests exist."""
     faulty = with_fault(fault, ROOT)
     assert faulty != (ROOT / fault.file).read_text()
     compile(faulty, fault.file, "exec")
@@ -34,7 +34,7 @@ def code(tmp_path: Path) -> Path:
 
 
 def test_faults_are_caught_or_missed(code: Path) -> None:
-    """2 + 2 is 4, and so is 2 x 2, but not 2 - 2. The code stays as it was."""
+    """The test of 2 + 2 misses a change to 2 * 2, and catches 2 - 2. The code itself is not changed."""
     before = (code / "hnerf" / "sums.py").read_text()
     minus, times = (Fault("sum", "sums", "a + b", f"a {sign} b") for sign in "-*")
     assert judge(minus, code).red == "tests/test_sums.py::test_total"
@@ -42,20 +42,20 @@ def test_faults_are_caught_or_missed(code: Path) -> None:
     assert (code / "hnerf" / "sums.py").read_text() == before
 
 
-def test_tests_that_a_fault_makes_wait_for_ever_are_ended(code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It adds zeros without end."""
+def test_tests_that_hang_because_of_a_fault_are_ended(code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fault adds zeros forever."""
     monkeypatch.setattr("tests.faults.LIMIT_S", 2.0)
     assert judge(Fault("sum", "sums", "a + b", "sum(iter(int, 1))"), code).red == "its time limit of 2 s"
 
 
-def test_what_cannot_run_is_no_catch(code: Path) -> None:
+def test_code_that_cannot_run_is_an_error_and_not_a_catch(code: Path) -> None:
     broken = Fault("sum", "sums", "a + b", "a +")
     with pytest.raises(RuntimeError, match="SyntaxError"):
         judge(broken, code)
 
 
 @pytest.mark.parametrize(("text", "times"), [("a * b", 0), ("a", 3)])
-def test_a_text_that_is_not_there_once_is_refused(code: Path, text: str, times: int) -> None:
+def test_a_text_that_is_not_found_exactly_once_is_refused(code: Path, text: str, times: int) -> None:
     with pytest.raises(ValueError, match=rf"^sum: found {times} times in hnerf/sums.py, not once"):
         judge(Fault("sum", "sums", text, "b"), code)
 

@@ -8,46 +8,46 @@ from hnerf.errors import InputError
 from hnerf.files import atomic_file, atomic_folder, made_folder, replace_text
 
 
-def test_it_takes_its_name_when_all_is_written(tmp_path: Path) -> None:
+def test_an_atomic_folder_gets_its_name_once_it_is_complete(tmp_path: Path) -> None:
     (tmp_path / "ada.partial").mkdir()
     (tmp_path / "ada.partial" / "old").touch()
     with atomic_folder(tmp_path / "ada") as folder:
         (folder / "new").touch()
         assert not (tmp_path / "ada").exists()
-    left = ["ada", "ada.partial", "ada.partial/old", "ada/new"]  # a folder of that name is not ours
+    left = ["ada", "ada.partial", "ada.partial/old", "ada/new"]  # an existing folder of that name is not ours
     assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == left
     assert (tmp_path / "ada").stat().st_mode == (tmp_path / "ada.partial").stat().st_mode
 
 
-def test_it_is_gone_if_anything_goes_wrong(tmp_path: Path) -> None:
+def test_an_atomic_folder_is_removed_after_an_error(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "a" / "b" / "ada") as folder:
         (folder / "half").touch()
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_exists_is_left_alone(tmp_path: Path) -> None:
+def test_an_existing_folder_is_refused_and_not_changed(tmp_path: Path) -> None:
     (tmp_path / "ada").mkdir()
     with pytest.raises(InputError, match="ada: exists; give the name of a new folder"), atomic_folder(tmp_path / "ada"):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]
 
 
-def test_a_link_to_nothing_is_found_before_the_work(tmp_path: Path) -> None:
+def test_a_dangling_link_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "out").symlink_to(tmp_path / "nothing")
     with pytest.raises(InputError, match="out: exists"), atomic_folder(tmp_path / "out"):
         raise AssertionError("too late")
 
 
-def test_folders_that_stay_empty_go_again_and_others_stay(tmp_path: Path) -> None:
+def test_made_folders_are_removed_if_they_stay_empty(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     with made_folder(tmp_path / "there"), made_folder(tmp_path / "a" / "b"), made_folder(tmp_path / "c"):
         (tmp_path / "c" / "new").touch()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c", "there"]
 
 
-def test_two_with_one_process_number_replace_a_text_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are in containers that share a folder."""
+def test_two_processes_with_one_id_can_replace_a_text_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in two containers that share a folder."""
 
     def replaced(*ends: Path) -> None:
         monkeypatch.setattr(os, "replace", replace)
@@ -60,7 +60,7 @@ def test_two_with_one_process_number_replace_a_text_at_once(tmp_path: Path, monk
     assert [path.name for path in tmp_path.iterdir()] == ["note"] and (tmp_path / "note").read_text() == "mine"
 
 
-def test_a_text_that_cannot_be_replaced_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_replacement_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "replace", Mock(side_effect=OSError("full")))
     with pytest.raises(OSError, match="full"):
         replace_text(tmp_path / "note", "mine")
@@ -68,7 +68,7 @@ def test_a_text_that_cannot_be_replaced_leaves_nothing(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("missing", ["folder", "file"])
-def test_an_error_names_the_file_and_not_the_one_beside_it(tmp_path: Path, missing: str) -> None:
+def test_an_error_names_the_file_and_not_its_temporary_copy(tmp_path: Path, missing: str) -> None:
     path = tmp_path / "no" / "ada.tar" if missing == "folder" else tmp_path / "ada.tar"
     with pytest.raises(FileNotFoundError) as caught, atomic_file(path) as beside:
         if missing == "folder":

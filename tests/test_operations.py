@@ -1,4 +1,4 @@
-"""The commands of docs/operations.md: each is executed as it stands there, or left out for a reason."""
+"""The commands of docs/operations.md: each is executed as written there, or left out for a stated reason."""
 
 import os
 import re
@@ -33,7 +33,7 @@ LEFT_OUT = {
     r"s3://BUCKET/captures": "captures in a bucket: tests/flows/test_train_subject.py, tests/soak.py",
     r"docker|(?i:kubernetes)|kubectl|containers\]|mkdir -p store c": "containers: tests/flows/test_work_pools.py",
 }
-LATER = r"prefect (server|worker) start"  # they run until the end
+LATER = r"prefect (server|worker) start"  # these run until the end of the test
 SMALL = """training: {field: {kind: fast, colour_cells: [24, 64], samples: 12}, steps: 12, novel_pose_steps: 2}
 detection: {hands: none}
 evaluation: {max_images: 1, max_meshes: 1, report_rows: 1}
@@ -49,11 +49,11 @@ def commands() -> list[str]:
 
 
 def reason(command: str) -> str:
-    """Return why a command is left out, empty if it is not."""
+    """Return why a command is left out, or an empty text if it is executed."""
     return next((why for pattern, why in LEFT_OUT.items() if re.search(pattern, command)), "")
 
 
-def test_the_page_has_commands_to_execute() -> None:
+def test_at_least_30_commands_of_the_page_are_executed() -> None:
     executed = [command for command in commands() if not reason(command)]
     assert len(executed) >= 30
     for command in executed:
@@ -62,7 +62,7 @@ def test_the_page_has_commands_to_execute() -> None:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """Return a copy of the tracked files, as `make install` leaves it, with a tiny capture and a tiny preset."""
+    """Return a copy of the tracked files, as after `make install`, with a tiny preset."""
     folder = tmp_path / "checkout"
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in listed.rstrip("\0").split("\0"):
@@ -81,8 +81,8 @@ def checkout(tmp_path: Path) -> Path:
     return folder
 
 
-def stand_ins(folder: Path) -> dict[str, str]:
-    """Write what the commands name; return what stands for what."""
+def write_stand_ins(folder: Path) -> dict[str, str]:
+    """Write files for the commands; return the text to put in place of each placeholder of the page."""
     from hnerf.config import SyntheticSettings
     from hnerf.synthetic import write_synthetic_capture
 
@@ -103,8 +103,8 @@ def stand_ins(folder: Path) -> dict[str, str]:
     }
 
 
-def shared_stand_ins(folder: Path) -> dict[str, str]:
-    """Copy real captures, which some commands need; return what stands for what."""
+def copy_shared_stand_ins(folder: Path) -> dict[str, str]:
+    """Copy the real captures that some commands need; return the text to put in place of each placeholder."""
     shutil.copytree(SHARED / "pose2sim-balance", folder / "balance")
     shutil.copytree(SHARED / "caliscope-charuco", folder / "boards")
     shutil.copytree(SHARED / "valid-walk", folder / "apart")
@@ -116,7 +116,7 @@ def shared_stand_ins(folder: Path) -> dict[str, str]:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return the environment of the commands: a server of their own."""
+    """Return the environment of the commands, with a Prefect server of their own."""
     port = free_port()
     return os.environ | {
         "PREFECT_HOME": str(folder / ".prefect"),
@@ -128,8 +128,8 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def start(command: str, folder: Path, variables: dict[str, str]) -> "subprocess.Popen[bytes]":
-    """Start what runs until the end; return once the server answers."""
-    # Prefect's worker ends by SIGINT, which a shell's background jobs ignore.
+    """Start a command that runs until the end of the test; return once the Prefect server answers."""
+    # Prefect's worker ends on SIGINT, which is ignored if the tests run as a shell's background job.
     listens = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     started = subprocess.Popen(shlex.split(command), cwd=folder, env=variables, preexec_fn=listens)
     deadline_s = time.monotonic() + PATIENCE_S
@@ -143,7 +143,7 @@ def start(command: str, folder: Path, variables: dict[str, str]) -> "subprocess.
 
 
 def executable(names: dict[str, str]) -> Iterator[str]:
-    """Yield the commands that are executed, with the stand-ins in their places."""
+    """Yield the commands to execute, with their placeholders replaced."""
     for command in commands():
         if reason(command) or (not SHARED.is_dir() and re.search("calibrate|synchronise", command)):
             continue
@@ -154,7 +154,7 @@ def executable(names: dict[str, str]) -> Iterator[str]:
 
 @pytest.mark.soak
 def test_every_command_works(checkout: Path) -> None:
-    names = (shared_stand_ins(checkout) if SHARED.is_dir() else {}) | stand_ins(checkout)
+    names = (copy_shared_stand_ins(checkout) if SHARED.is_dir() else {}) | write_stand_ins(checkout)
     variables = environment(checkout)
     names |= {"4200": variables["PREFECT_SERVER_API_PORT"], "deployment run": "deployment run --watch"}
     subprocess.run(".venv/bin/python -m flows.server_password > .env", shell=True, cwd=checkout, check=True)

@@ -11,12 +11,12 @@ def reported(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
     return caplog
 
 
-def test_items_are_reported_before_each_and_at_the_end(reported: pytest.LogCaptureFixture) -> None:
+def test_progress_is_reported_before_each_item_and_at_the_end(reported: pytest.LogCaptureFixture) -> None:
     assert list(progress.tracked("ab", "letters", 2)) == ["a", "b"]
     assert [record.progress for record in reported.records] == [("letters", done, 2) for done in (0, 1, 2)]
 
 
-def test_work_that_fails_has_ended(reported: pytest.LogCaptureFixture) -> None:
+def test_failed_work_is_reported_as_ended(reported: pytest.LogCaptureFixture) -> None:
     items = progress.tracked("abc", "letters", 3)
     next(items)
     with pytest.raises(ValueError, match="broken"):
@@ -24,7 +24,7 @@ def test_work_that_fails_has_ended(reported: pytest.LogCaptureFixture) -> None:
     assert [record.progress.done for record in reported.records] == [0, 3]
 
 
-def test_another_process_is_reported_as_it_reports_itself(
+def test_progress_of_another_process_is_relayed(
     reported: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(progress.log, "handlers", [])
@@ -39,6 +39,6 @@ def test_another_process_is_reported_as_it_reports_itself(
     assert [record.progress for record in reported.records] == [("training", 1.5, 4), ("training", 4, 4)]
 
 
-def test_what_another_wrote_into_the_line_is_left_out(reported: pytest.LogCaptureFixture) -> None:
+def test_text_of_another_process_on_the_line_is_dropped(reported: pytest.LogCaptureFixture) -> None:
     assert progress.report_relayed(progress.RECORD_SEPARATOR + '["training", 1, 4]INFO: created')
     assert [record.progress for record in reported.records] == [("training", 1, 4)]

@@ -1,4 +1,4 @@
-"""Results as JSON files: what is refused, and that the committed schemas are those of the code."""
+"""Results as JSON files: invalid ones are refused, and the committed schemas match the code."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ NONE = {"n": 0, "per_image": []} | MEANS | {"reason": "no test camera"}
 SCORES = {"camera": "a", "trained_on": ["b"], "novel_view": NONE, "novel_pose": NONE}
 
 
-def test_a_result_is_written_as_it_is(tmp_path: Path) -> None:
+def test_a_valid_result_is_written_unchanged(tmp_path: Path) -> None:
     write_result(tmp_path / "holdout.json", HeldOutCamera, SCORES)
     assert (tmp_path / "holdout.json").read_text() == json.dumps(SCORES, indent=1)
 
@@ -24,14 +24,14 @@ def test_a_result_is_written_as_it_is(tmp_path: Path) -> None:
     "wrong",
     [SCORES | {"psnr": 1.0}, SCORES | {"novel_pose": NONE | {"lips": None}}, {"camera": "a"}, SCORES | {"camera": 1}],
 )
-def test_keys_that_a_result_has_not_or_lacks_and_other_types_are_refused(tmp_path: Path, wrong: Any) -> None:
+def test_unknown_keys_missing_keys_and_wrong_types_are_refused(tmp_path: Path, wrong: Any) -> None:
     with pytest.raises(ValidationError):
         write_result(tmp_path / "holdout.json", HeldOutCamera, wrong)
     assert not (tmp_path / "holdout.json").exists()
 
 
-def test_the_committed_schemas_are_fresh(tmp_path: Path) -> None:
-    """Otherwise run `python -m hnerf.results docs/schemas`."""
+def test_the_committed_schemas_are_up_to_date(tmp_path: Path) -> None:
+    """If this fails, run `python -m hnerf.results docs/schemas`."""
     write_schemas(tmp_path)
     assert {path.stem for path in SCHEMAS.iterdir()} == set(FILES)
     for path in SCHEMAS.iterdir():

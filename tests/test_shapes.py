@@ -1,4 +1,4 @@
-"""Shapes in annotations are checked under tests (tests/conftest.py)."""
+"""The tests check shapes in annotations (tests/conftest.py)."""
 
 import pytest
 import torch
@@ -8,6 +8,6 @@ from hnerf.fields.compositing import composite
 
 
 def test_a_wrong_shape_is_refused() -> None:
-    """Three weights a ray, and four values."""
+    """Pass three weights per ray, but four values."""
     with pytest.raises(TypeCheckError, match="composite"):
         composite(torch.zeros(2, 3), torch.zeros(2, 4, 3))

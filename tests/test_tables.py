@@ -1,4 +1,4 @@
-"""Markdown tables, by hand."""
+"""Markdown tables, compared with ones written by hand."""
 
 from hnerf.tables import head, line, pick, shown
 

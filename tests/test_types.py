@@ -1,11 +1,11 @@
-"""mypy as a test, so that its one process runs beside the other tests."""
+"""mypy as a test, so that its single process runs in parallel with the other tests."""
 
 import subprocess
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-# Without collecting garbage, which takes a fifth of the time of a process that ends when it is done.
+# Without garbage collection, which would take a fifth of the time and is useless in so short a process.
 MYPY = "import gc; gc.disable(); gc.enable = int; from mypy.main import main; main()"
 
 

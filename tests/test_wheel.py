@@ -1,4 +1,4 @@
-"""What is installed from a wheel: every file that the code reads, as setuptools itself finds them."""
+"""A wheel contains every file that the code reads; setuptools itself lists its contents."""
 
 from pathlib import Path
 
@@ -9,14 +9,14 @@ ROOT = Path(__file__).parents[1]
 PACKAGED = ("configs", "flows", "hnerf", "tasks")
 
 
-def test_a_wheel_holds_every_file_of_the_packages_and_every_preset(
+def test_a_wheel_contains_all_files_of_the_packages_and_all_presets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
     distribution = Distribution()
-    distribution.script_name = "setup.py"  # which it leaves out, and takes for granted
+    distribution.script_name = "setup.py"  # setuptools needs it, but does not set it here
     distribution.parse_config_files()
-    distribution.include_package_data = False  # which would ask a version control that is not there
+    distribution.include_package_data = False  # this would query a version control system, which may be absent
     build = distribution.get_command_obj("build_py")
     build.build_lib = str(tmp_path)
     build.ensure_finalized()
