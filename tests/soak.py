@@ -122,7 +122,7 @@ def soak(
             if time.monotonic() < kill_s:
                 continue
             kill_s = time.monotonic() + kill_every_s * random.uniform(0.5, 1.5)
-            if run := machines[at].run():  # without a run, skip it; later it would hit the last run
+            if run := machines[at].run():  # without a run, skip it: later it might hit the last
                 if kills.total() % 2:
                     machines[at] = machines[at].lose()
                 else:
@@ -162,7 +162,7 @@ def soak(
 
 @contextmanager
 def database() -> Iterator[None]:
-    """Give the server a PostgreSQL of its own, if one is installed. On SQLite, two workers of a busy machine can make it
+    """Give the server a PostgreSQL of its own, if installed: on SQLite, two workers of a busy machine can make it
     wait for minutes."""
     if not BINARIES:
         yield

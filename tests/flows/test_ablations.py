@@ -1,4 +1,4 @@
-"""Selection of ablations, and the table from made-up scores."""
+"""The choice of ablations, and the table of made-up scores."""
 
 import json
 from pathlib import Path
@@ -28,9 +28,9 @@ SPLIT = {
 
 @pytest.fixture
 def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSettings]:
-    """Replace every stage; the list collects the training settings of each row. Training fails without noise and loses
-    its worker without the eikonal loss; evaluation finds as many dB as the segmentation loss weighs, and no surface
-    without the residual loss."""
+    """Replace every stage by a fake; return the list that collects the training settings of each row. Training fails
+    without noise, and loses its worker without the eikonal loss. The PSNR in dB equals the weight of the segmentation
+    loss; without the residual loss, evaluation finds no surface."""
     trained: list[TrainingSettings] = []
 
     def train(*inputs: Any) -> Any:
@@ -69,11 +69,11 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
     return trained
 
 
-def test_the_paper_preset_has_a_row_for_every_loss_and_switch() -> None:
+def test_the_paper_preset_has_a_row_for_each_of_its_losses_and_switches() -> None:
     rows, left_out = choose(load_settings("paper"), [])
     losses = {f"no-{name}" for name in load_settings("paper").training.losses.model_dump()}
     others = {"no-eta", "no-density_threshold", "no-density_steepness", "no-geometry_roles"}
-    others |= {"no-elastic", "no-floor", "no-fog"}  # which are not the paper's
+    others |= {"no-elastic", "no-floor", "no-fog"}  # these are not part of the published method
     assert next(iter(rows)) == "full"
     assert set(rows) == {"full", "no-opt", "no-root", "no-noise"} | losses - others
     assert left_out == {"no-deformation": "the paper field has no such part"}
@@ -98,7 +98,7 @@ def _leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def test_what_is_off_or_unused_is_left_out() -> None:
+def test_ablations_of_unused_parts_are_left_out() -> None:
     rows, left_out = choose(load_settings("fast"), [])
     assert left_out == {
         **dict.fromkeys(["no-blend", "no-fit", "no-geometry", "no-increment", "no-mask"], "off already"),
@@ -124,7 +124,7 @@ def test_parts_of_h_nerf_are_left_out_of_other_methods(preset: str) -> None:
     assert left_out == dict.fromkeys(["no-root", "no-deformation"], f"the {kind} field has no such part")
 
 
-def test_an_override_counts_as_the_preset_but_not_against_the_ablation() -> None:
+def test_overrides_apply_to_every_row_before_its_ablation() -> None:
     rows, left_out = choose(load_settings("fast", ["training.losses.mask=0.5", "training.steps=7"]), ["no-mask"])
     assert left_out == {}
     assert [row.training.losses.mask for row in rows.values()] == [0.5, 0.0]
@@ -138,7 +138,7 @@ def test_unknown_names_are_refused() -> None:
         choose(load_settings("fast"), ["no-hair"])
 
 
-def test_the_table_by_hand() -> None:
+def test_the_table_equals_one_written_by_hand() -> None:
     bare = {"psnr": None, "ssim": None, "mask_iou": None, "geometry": None}
     full = {"novel_view": SPLIT, "novel_pose": SPLIT, "novel_pose_posed": bare, "novel_pose_tracked": SPLIT}
     result = {
@@ -170,7 +170,9 @@ def test_the_table_by_hand() -> None:
     ]
 
 
-def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettings], tmp_path: Path) -> None:
+def test_a_failed_row_holds_its_error_and_the_other_rows_are_computed(
+    stages: list[TrainingSettings], tmp_path: Path
+) -> None:
     table = ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-noise", "no-residual", "no-segmentation"])
     assert table == tmp_path / "store" / "ablations" / "ada-fast-part.md"
     result = json.loads(table.with_suffix(".json").read_text())
@@ -183,7 +185,9 @@ def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettin
     assert table.read_text() == as_markdown(result)
 
 
-def test_the_table_of_another_capture_of_the_name_stays(stages: list[TrainingSettings], tmp_path: Path) -> None:
+def test_the_table_of_another_capture_with_the_same_name_is_kept(
+    stages: list[TrainingSettings], tmp_path: Path
+) -> None:
     table = ablate.fn(tmp_path / "ada", "fast", tmp_path / "store", [], ["no-segmentation"])
     before, trained = table.read_text(), len(stages)
     with pytest.raises(InputError, match=f"ada-fast-part.md: is of {tmp_path}/ada, not of {tmp_path}/other"):
@@ -191,8 +195,8 @@ def test_the_table_of_another_capture_of_the_name_stays(stages: list[TrainingSet
     assert table.read_text() == before and len(stages) == trained
 
 
-def test_new_poses_are_not_scored_of_what_has_none(stages: list[TrainingSettings], tmp_path: Path) -> None:
-    """Run the paper's method on one frame."""
+def test_a_method_without_novel_poses_has_no_scores_for_them(stages: list[TrainingSettings], tmp_path: Path) -> None:
+    """The published method, trained on one frame."""
     table = ablate.fn(tmp_path, "paper", tmp_path / "store", [], ["no-segmentation"])
     rows = json.loads(table.with_suffix(".json").read_text())["rows"]
     assert rows["full"]["novel_pose"]["reason"] == "H-NeRF's static network models one moment"
@@ -201,7 +205,7 @@ def test_new_poses_are_not_scored_of_what_has_none(stages: list[TrainingSettings
     assert table.read_text().count("H-NeRF's static network") == table.read_text().count(f"- {expected}\n") == 1
 
 
-def test_the_flow_runs_page_shows_the_table(
+def test_the_page_of_the_flow_run_shows_the_table(
     stages: list[TrainingSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
@@ -211,7 +215,9 @@ def test_the_flow_runs_page_shows_the_table(
     assert shown == [table.read_text()]
 
 
-def test_a_lost_worker_ends_the_command_and_finished_rows_stand(stages: list[TrainingSettings], tmp_path: Path) -> None:
+def test_a_lost_worker_ends_the_command_and_finished_rows_are_kept(
+    stages: list[TrainingSettings], tmp_path: Path
+) -> None:
     with pytest.raises(LostWorkerError):
         ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-opt", "no-eikonal", "no-residual"])
     result = json.loads((tmp_path / "store" / "ablations" / "ada-fast-part.json").read_text())

@@ -18,8 +18,8 @@ PATIENCE_S = 90.0
 
 
 @pytest.fixture
-def called() -> Iterator[tuple[str, list[Any]]]:
-    """Return the address of a webhook, and what it was called with."""
+def webhook_calls() -> Iterator[tuple[str, list[Any]]]:
+    """Yield the URL of a webhook, and the list of messages that it receives."""
     heard: list[Any] = []
 
     class Webhook(BaseHTTPRequestHandler):
@@ -37,15 +37,17 @@ def called() -> Iterator[tuple[str, list[Any]]]:
         server.shutdown()
 
 
-def test_the_operator_is_told_once_however_often_it_is_set_up(prefect_api: str, called: tuple[str, list[Any]]) -> None:
-    url, heard = called
+def test_setting_up_twice_makes_each_automation_once_and_calls_the_webhook(
+    prefect_api: str, webhook_calls: tuple[str, list[Any]]
+) -> None:
+    url, heard = webhook_calls
     for _ in range(2):
         names = set_up(url, "local", 150)
     with get_client(sync_client=True) as client:
         known = {one.name: one for one in client.read_automations()}
         assert len(known) == len(names) == 5 and known.keys() == set(names)
         deadline = time.monotonic() + PATIENCE_S
-        while not heard and time.monotonic() < deadline:  # the server reads automations now and then
+        while not heard and time.monotonic() < deadline:  # the server rereads automations only from time to time
             resource = {"prefect.resource.id": "hnerf.store./store", "prefect.resource.name": 'the "store"'}
             emit_event(DISK_EVENT, resource=resource, payload={"free_gib": 1.5})
             time.sleep(1)
@@ -62,7 +64,7 @@ def test_without_a_webhook_only_lost_runs_are_ended(prefect_api: str) -> None:
         client.delete_automation(automation.id)
 
 
-def test_silence_is_longer_than_some_heartbeats() -> None:
+def test_every_sign_of_life_of_a_run_resets_the_silence() -> None:
     trigger = lost_runs(150).trigger
     signs = ("heartbeat", "Pending", "Submitting", "InfrastructurePending", "pull-step.executed")
     assert trigger.after == {f"prefect.flow-run.{sign}" for sign in signs} and trigger.posture == "Proactive"
@@ -71,10 +73,10 @@ def test_silence_is_longer_than_some_heartbeats() -> None:
 @pytest.mark.soak
 @pytest.mark.parametrize("pulled", [False, True])
 @pytest.mark.parametrize("state", [Pending, Submitting])
-def test_a_run_whose_worker_is_lost_while_it_begins_it_crashes(
+def test_a_run_crashes_if_its_worker_is_lost_before_the_run_begins(
     prefect_api: str, state: Callable[[], State], pulled: bool
 ) -> None:
-    """It has no heartbeat yet, and would be about to begin for ever."""
+    """Without a heartbeat, such a run would otherwise stay pending forever."""
     with get_client(sync_client=True) as client:
         automation = client.create_automation(lost_runs(10))
         time.sleep(5)  # until the server has read it
@@ -91,20 +93,20 @@ def test_a_run_whose_worker_is_lost_while_it_begins_it_crashes(
     assert now.is_crashed() and now.message == "no sign of life for 10 s: its process or its machine was lost"
 
 
-def test_without_a_server_one_line_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_error_of_a_missing_server_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with temporary_settings({PREFECT_API_URL: "http://127.0.0.1:9/api"}), pytest.raises(SystemExit, match="2"):
         main([])
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("http://127.0.0.1:9/api: ") and "is the server running" in line
 
 
-def test_a_silence_shorter_than_healthy_runs_keep_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_silence_shorter_than_that_of_healthy_runs_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["--silence", "30"])
     assert "give 60 or more" in capsys.readouterr().err
 
 
-def test_nothing_is_told_to_a_server_that_would_end_with_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_automations_are_set_up_in_a_temporary_server(capsys: pytest.CaptureFixture[str]) -> None:
     with temporary_settings(restore_defaults={PREFECT_API_URL}), pytest.raises(SystemExit, match="2"):
         main([])
     assert capsys.readouterr().err.startswith("no server is set; give this command in the folder of prefect.toml")

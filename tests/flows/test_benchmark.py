@@ -1,4 +1,4 @@
-"""The benchmark flow with fake stages, and its own stage's place in the store."""
+"""The benchmark flow with fake stages, and the caching of its scoring stage in the store."""
 
 import base64
 import json
@@ -49,14 +49,14 @@ PSNR = {"fast": 30.0, "paper": 20.0}
 
 
 class Stages(list[tuple[str, TrainingSettings]]):
-    """The trainings that were requested: recording and settings of each; `fails` by field kind."""
+    """The recording and settings of each requested training; `fails`: the error that a kind of field raises."""
 
     fails: dict[str, Exception]
 
 
 @pytest.fixture
 def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
-    """Replace every stage."""
+    """Replace every stage by a fake; return the list of requested trainings."""
     asked = Stages()
     asked.fails = {}
 
@@ -94,7 +94,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_charts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw no charts, which take a second each time."""
     monkeypatch.setattr(publish_module, "draw_charts", lambda *_: [])
 
@@ -106,7 +106,7 @@ def study(tmp_path: Path) -> str:
 
 
 def true_mask(folder: Path) -> Path:
-    """Return the one that the test camera has."""
+    """Return the path of the test camera's only true mask."""
     return folder / "ground_truth" / "masks" / "5" / "000000.png"
 
 
@@ -115,8 +115,8 @@ def read(table: Path) -> dict[str, Any]:
     return result
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_every_method_of_every_variant_is_trained_alike(stages: Stages, study: str, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_charts")
+def test_every_method_of_every_variant_is_trained_for_the_same_time(stages: Stages, study: str, tmp_path: Path) -> None:
     table = benchmark.fn(tmp_path, study, store=tmp_path / "store")
     one = str((None, (0,), ()))
     assert [title for title, _ in stages] == ["whole", "whole", one, one, one]
@@ -131,11 +131,11 @@ def test_every_method_of_every_variant_is_trained_alike(stages: Stages, study: s
     assert variants["all"]["methods"]["demo"]["novel_view"]["psnr"] == 30.0
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
+@pytest.mark.usefixtures("without_charts")
+def test_trainings_get_longer_until_their_curve_is_flat_or_time_or_steps_end(
     stages: Stages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Let fast have steps for 30 s; demo, made NeRF, is flat at 640 s and too young for a surface at 10 s."""
+    """`fast` has steps for 30 s only. `nerf` has no surface yet at 10 s, and its curve is flat at 640 s."""
     psnr = {20.0: 18.0, 40.0: 18.0, 80.0: 20.0, 160.0: 24.0, 320.0: 25.0, 640.0: 25.05}
 
     def score_end(*inputs: Any) -> Any:
@@ -160,17 +160,17 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
     fast, nerf = found["variants"]["one"]["methods"].values()
     assert (fast["ended"], [row["seconds"] for row in fast["curve"]]) == ("steps", [10.0, 20.0, 30.0])
     assert (nerf["ended"], [row["seconds"] for row in nerf["curve"]]) == ("flat", list(psnr))
-    assert [training.seconds for _, training in stages][-2:] == [640.0, 640.0]  # the second is in the store
+    assert [training.seconds for _, training in stages][-2:] == [640.0, 640.0]  # the second is found in the store
     assert nerf["novel_view"]["psnr"] == 25.05
     true_mask(tmp_path).unlink()
-    monkeypatch.setattr(RECORDED, "has_given_mask", lambda *_: True)  # those of the recording will do
+    monkeypatch.setattr(RECORDED, "has_given_mask", lambda *_: True)  # the recording's masks suffice
     (tmp_path / "mine.yaml").write_text(f"{text}100")
     found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))
     assert found["variants"]["one"]["methods"]["nerf"]["ended"] == "limit"
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_method_that_always_fails_is_trained_once_for_each_time(stages: Stages, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_charts")
+def test_a_method_that_always_fails_is_trained_once_per_duration(stages: Stages, tmp_path: Path) -> None:
     text = "title: t\nmethods: [fast]\nvariants: {one: {}}\nuntil_flat: true\nsnapshots: 0\nseconds: 40"
     (tmp_path / "mine.yaml").write_text(text)
     stages.fails["fast"] = InputError("the surface is empty")
@@ -191,7 +191,7 @@ def test_the_recording_is_read_within_the_limits_of_the_preset(
 
 
 @pytest.mark.parametrize("lacks", ["test cameras", "masks"])
-def test_nothing_is_trained_until_flat_where_no_image_can_be_scored(
+def test_until_flat_is_refused_if_no_image_can_be_scored(
     stages: Stages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lacks: str
 ) -> None:
     if lacks == "masks":
@@ -203,9 +203,9 @@ def test_nothing_is_trained_until_flat_where_no_image_can_be_scored(
     assert stages == []
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_charts")
 @pytest.mark.parametrize("error", [RuntimeError("rank 0\nthe surface is empty"), InputError("the surface is empty")])
-def test_a_method_that_fails_says_so_and_the_rest_go_on(
+def test_a_failed_method_holds_its_error_and_the_others_are_trained(
     stages: Stages, study: str, tmp_path: Path, error: Exception
 ) -> None:
     stages.fails["fast"] = error
@@ -214,9 +214,9 @@ def test_a_method_that_fails_says_so_and_the_rest_go_on(
     assert methods["paper"]["novel_view"]["psnr"] == 20.0
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_charts")
 @pytest.mark.parametrize("stage", ["subset_capture", "score_training"])
-def test_a_method_that_cannot_be_given_its_part_or_scored_fails_alone(
+def test_a_failure_in_subset_or_scoring_affects_one_method_only(
     stages: Stages, study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
     good = getattr(module, stage)
@@ -231,16 +231,16 @@ def test_a_method_that_cannot_be_given_its_part_or_scored_fails_alone(
     assert variants["one frame"]["methods"]["fast"] == {"error": "the surface is empty"}
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_camera_that_the_capture_lacks_is_told_before_anything_is_trained(stages: Stages, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_charts")
+def test_a_variant_with_an_unknown_camera_is_left_out_before_training(stages: Stages, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("title: t\nmethods: [fast]\nvariants: {two: {cameras: ['1', '9']}}")
     found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))["variants"]
     assert found["two"] == {"left_out": "ada: no training camera 9; there are 1, 2, 3, 4"}
     assert stages == []
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_lost_worker_ends_the_flow_and_what_is_finished_stands(stages: Stages, study: str, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_charts")
+def test_a_lost_worker_ends_the_flow_and_finished_methods_are_kept(stages: Stages, study: str, tmp_path: Path) -> None:
     stages.fails["paper"] = LostWorkerError("rank 0 was killed by SIGKILL")
     with pytest.raises(LostWorkerError):
         benchmark.fn(tmp_path, study, store=tmp_path / "store")
@@ -260,7 +260,7 @@ def test_the_command_prints_table_and_chart(
     assert f"chart: {chart}" in shown and chart.exists()
 
 
-@pytest.mark.usefixtures("stages", "undrawn")
+@pytest.mark.usefixtures("stages", "without_charts")
 @pytest.mark.parametrize(
     ("methods", "seconds", "name"),
     [
@@ -274,11 +274,11 @@ def test_a_part_of_a_study_does_not_replace_its_table(
 ) -> None:
     table = benchmark.fn(tmp_path, study, methods, seconds, tmp_path / "store")
     assert table.name == name
-    assert json.loads(table.with_suffix(".json").read_text())["study"] == "toys"  # in the caption
+    assert json.loads(table.with_suffix(".json").read_text())["study"] == "toys"  # as in the caption
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_the_table_of_another_capture_of_the_name_stays(stages: Stages, study: str, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_charts")
+def test_the_table_of_another_capture_with_the_same_name_is_kept(stages: Stages, study: str, tmp_path: Path) -> None:
     benchmark.fn(tmp_path / "ada", study, ["demo"], store=tmp_path / "store")
     trained = len(stages)
     with pytest.raises(InputError, match=f"ada-toys-part.md: is of {tmp_path}/ada, not of {tmp_path}/other"):
@@ -286,7 +286,7 @@ def test_the_table_of_another_capture_of_the_name_stays(stages: Stages, study: s
     assert len(stages) == trained
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_charts")
 def test_quick_is_a_study(stages: Stages, tmp_path: Path) -> None:
     assert main(["benchmark", str(tmp_path), "--quick", "--methods", "fast", "--store", str(tmp_path / "store")]) == 0
     assert (tmp_path / "store" / "benchmark" / "ada-quick-part.md").exists()
@@ -294,14 +294,16 @@ def test_quick_is_a_study(stages: Stages, tmp_path: Path) -> None:
         main(["benchmark", str(tmp_path), "--quick", "--study", "static"])
 
 
-def test_bad_names_end_with_one_line(stages: Stages, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_error_of_an_unknown_method_is_one_line(
+    stages: Stages, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["benchmark", str(tmp_path), "--methods", "fats", "--store", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith("hnerf: fats: no such preset or file")
     assert stages == []
 
 
 @pytest.mark.usefixtures("stages")
-def test_the_flow_runs_page_shows_the_charts_themselves(
+def test_the_page_of_the_flow_run_embeds_the_charts(
     study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
@@ -313,16 +315,14 @@ def test_the_flow_runs_page_shows_the_charts_themselves(
     assert f"![ada-toys-part.png](data:image/png;base64,{chart})" in text
 
 
-def test_charts_are_found_whatever_the_captures_name(tmp_path: Path) -> None:
+def test_charts_of_captures_with_unusual_names_are_embedded(tmp_path: Path) -> None:
     (tmp_path / "Ada (2) b-toys.png").write_bytes(b"chart")
     (tmp_path / "Ada (2) b-toys.md").write_text(f"# Toys\n\n{markdown_image('Ada (2) b-toys.png')}\n")
     shown = embed_images(tmp_path / "Ada (2) b-toys.md")
     assert shown == "# Toys\n\n![Ada (2) b-toys.png](data:image/png;base64,Y2hhcnQ=)\n"
 
 
-def test_scores_are_found_again_until_what_is_scored_or_how_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scores_are_reused_until_the_inputs_or_settings_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counted: list[Path] = []
 
     def score(scene: Any, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
@@ -349,7 +349,7 @@ def test_scores_are_found_again_until_what_is_scored_or_how_changes(
     run(truth, ScoringSettings(images=3))
     mesh.write_text("truer")
     for stage in (tasks_module.score_training, tasks_module.score_end_of_training):
-        with pytest.raises(InputError, match="ada/ground_truth: changed"):  # nothing is kept under the old key
+        with pytest.raises(InputError, match="ada/ground_truth: changed"):  # nothing may be stored under the old key
             stage(store, truth, recording, calibration, body, model, ScoringSettings(images=4))
     run(read_capture(tmp_path / "ada")[1], ScoringSettings())
     assert len(counted) == 4

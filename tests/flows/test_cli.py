@@ -77,7 +77,7 @@ from tests.shared_data import shared_capture
         (["synth", "ring", "--set", "cameras=32"], "cameras: no such key; did you mean test_cameras?"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(
+def test_the_error_of_bad_input_is_one_line_with_exit_code_2(
     arguments: list[str],
     message: str,
     tmp_path: Path,
@@ -105,7 +105,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
         (BucketError("s3://x/fit/k.tar: no answer"), "hnerf: s3://x/fit/k.tar: no answer\n"),
     ],
 )
-def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(
+def test_the_error_of_a_failed_run_is_one_line_with_exit_code_1(
     error: Exception, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(train_subject, "fn", Mock(side_effect=error))
@@ -113,7 +113,7 @@ def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(
     assert capsys.readouterr().err == line
 
 
-def test_a_store_that_cannot_be_made_is_one_line_and_exit_code_2(
+def test_the_error_of_a_store_that_cannot_be_created_is_one_line_with_exit_code_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "ada").mkdir()
@@ -124,13 +124,13 @@ def test_a_store_that_cannot_be_made_is_one_line_and_exit_code_2(
         assert line.startswith(f"hnerf: {store}") and why in line
 
 
-def test_a_fault_that_may_pass_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_transient_error_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train_subject, "fn", Mock(side_effect=OSError(errno.EIO, "Input/output error", "a.jpg")))
     with pytest.raises(OSError, match="Input/output error"):
         main(["run", str(tmp_path)])
 
 
-def test_a_full_disk_is_one_line_and_exit_code_1(
+def test_the_error_of_a_full_disk_is_one_line_with_exit_code_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for error in (OSError("a.png: cannot be written; is the disk full?"), OSError(errno.ENOSPC, "No space left", "b")):
@@ -140,8 +140,10 @@ def test_a_full_disk_is_one_line_and_exit_code_1(
         assert line == f"hnerf: {error}; make room and give the same command again"
 
 
-def test_the_memory_of_commands_that_read_a_recording_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As is advised where it is too little."""
+def test_commands_that_read_a_recording_accept_its_memory_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error for too little memory advises to raise this setting."""
     found = []
     monkeypatch.setattr("tasks.cage.run_caged", lambda *_, **__: found.append(current_limits().reader_gib))
     for command in (["calibrate"], ["synchronise"], ["export-cameras", "--format", "colmap"]):
@@ -151,7 +153,9 @@ def test_the_memory_of_commands_that_read_a_recording_is_set(tmp_path: Path, mon
     assert found == [20, 20, 20]
 
 
-def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_that_write_cameras_never_overwrite_the_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "ada").mkdir()
     for command in (
         ["export-cameras", str(tmp_path / "ada"), "--format", "easymocap"],
@@ -166,7 +170,7 @@ def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys:
 def test_cameras_are_not_exported_into_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its digest, and with it the key of every result, would be another."""
+    """That would change the recording's digest, and with it the key of every result."""
     folder = write_easymocap(tmp_path / "ada")
     before = sorted(folder.iterdir())
     monkeypatch.chdir(folder)
@@ -180,14 +184,14 @@ def test_cameras_are_not_exported_into_the_recording(
 def test_nothing_new_is_written_into_the_recording(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The subject's folder notes which that is."""
+    """The subject's folder records where its recording is."""
     store, recording = Store(tmp_path / "store"), tmp_path / "recordings" / "ada"
     recording.mkdir(parents=True)
     store.claim("ada", "d" * 64, recording)
     monkeypatch.chdir(store.subject_folder("ada"))
     assert main([*command.split(), "--out", f"{recording}/new"]) == 2
     assert f"hnerf: {recording}/new: lies in the recording" in capsys.readouterr().err
-    assert main([*command.split(), "--out", "new"]) == 2  # as there are no results
+    assert main([*command.split(), "--out", "new"]) == 2  # refused, but only because there are no results
     assert "lies in the recording" not in capsys.readouterr().err
     assert list(recording.iterdir()) == []
 
@@ -196,7 +200,7 @@ def test_nothing_new_is_written_into_the_recording(
 def test_nothing_new_is_written_into_an_artifact(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`hnerf store verify` would find a fault in it from then on."""
+    """Otherwise `hnerf store verify` would report a fault from then on."""
     monkeypatch.chdir(tmp_path)
     artifact = Store(tmp_path / "store").get_or_compute("asset", "ab" * 16, lambda _: {})
     Path("ada").mkdir()
@@ -213,10 +217,10 @@ def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: 
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]
 
 
-def test_check_prints_every_camera_and_the_verdict(
+def test_check_cameras_prints_every_camera_and_the_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for drawn in ("cameras", "evidence"):  # seconds
+    for drawn in ("cameras", "evidence"):  # drawing takes seconds
         monkeypatch.setattr(f"hnerf.calibration.report.draw_{drawn}", lambda *_: None)
     capture, preset = shared_capture("valid-wave"), tmp_path / "no-hands.yaml"
     preset.write_text("based_on: fast\ndetection: {hands: none}\ncapture: {max_frames: 4, max_side_px: 128}\n")
@@ -238,7 +242,7 @@ def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert written == [SyntheticSettings(train_cameras=32, train_frames=1), SyntheticSettings()]
 
 
-def test_synth_writes_whole_or_nothing(
+def test_an_interrupted_synth_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(out: Path, settings: object) -> None:
@@ -251,7 +255,7 @@ def test_synth_writes_whole_or_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_and_refusals_do_without_what_takes_seconds_to_import() -> None:
+def test_help_and_refusals_import_no_heavy_libraries() -> None:
     code = """
 import sys
 from contextlib import suppress
@@ -267,7 +271,7 @@ for arguments in (["--help"], ["run", "--help"], ["run", "absent"], ["run"], ["s
     assert ended.returncode == 0, ended.stderr
 
 
-def test_the_first_line_comes_before_what_takes_seconds(
+def test_the_first_output_line_names_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(train_subject, "fn", lambda *_: Trained(tmp_path, tmp_path, tmp_path))
@@ -276,7 +280,7 @@ def test_the_first_line_comes_before_what_takes_seconds(
     assert first.endswith(f" hnerf: run {tmp_path}")
 
 
-def test_output_that_nobody_reads_ends_a_command_quietly() -> None:
+def test_a_closed_output_pipe_ends_a_command_quietly() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     code = "import sys; from flows.cli import main; sys.exit(main(['settings']))"
@@ -307,7 +311,7 @@ def test_output_that_nobody_reads_ends_a_command_quietly() -> None:
         ("store gc --keep 0", "--keep: give 1 or more"),
     ],
 )
-def test_what_an_option_does_not_take_is_answered_with_what_it_takes(
+def test_the_error_of_an_invalid_option_value_states_the_valid_range(
     arguments: str, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -315,13 +319,13 @@ def test_what_an_option_does_not_take_is_answered_with_what_it_takes(
     assert capsys.readouterr().err.endswith(f"error: argument {message}\n")
 
 
-def test_the_module_is_the_command() -> None:
+def test_the_module_can_be_run_as_the_command() -> None:
     command = [sys.executable, "-m", "flows.cli", "settings", "--preset", "nope"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 2 and "nope: no such preset" in ended.stderr
 
 
-def test_choices_and_ranges_are_those_of_the_library() -> None:
+def test_choices_and_ranges_match_the_library() -> None:
     assert tuple(WRITERS) == CAMERA_FORMATS
     assert OUTPUT_KINDS == PICTURES
     assert (MIN_SIZE_PX, MAX_SIZE_PX) == SIZES_PX
@@ -329,7 +333,9 @@ def test_choices_and_ranges_are_those_of_the_library() -> None:
     assert PICTURES_OF_AN_ORBIT == ORBIT_PICTURES
 
 
-def test_kinds_of_pictures_are_a_list_with_or_without_spaces(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_list_of_image_kinds_may_contain_spaces_and_duplicates(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     asked: list[RenderOptions] = []
     monkeypatch.setattr("hnerf.render.subject.render_subject", lambda _, wanted, __: asked.append(wanted) or 1)
     for given in ([], ["--what", "colour, mask,colour"]):
@@ -338,7 +344,7 @@ def test_kinds_of_pictures_are_a_list_with_or_without_spaces(monkeypatch: pytest
 
 
 @pytest.mark.parametrize(("flags", "allowed"), [([], False), (["--allow-poor"], True)])
-def test_a_poor_asset_is_accepted_by_flag(
+def test_a_flag_accepts_a_poor_asset(
     flags: list[str], allowed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[AssetSettings] = []

@@ -25,7 +25,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(scope="module")
 def deployed(prefect_api: str) -> str:
-    """Return the API of a server with the deployments of prefect.yaml."""
+    """Return the URL of a server that has the deployments of prefect.yaml."""
     with get_client(sync_client=True) as client:
         client.create_work_pool(WorkPoolCreate(name="local", type="process"))
     environment = os.environ | {"PREFECT_API_URL": prefect_api}
@@ -56,7 +56,7 @@ def test_cron_deployment_yields_scheduled_runs_five_minutes_apart(deployed: str)
     ("flow", "what"),
     [("train-subject", "preset"), ("benchmark", "study"), ("stability", "study"), ("ablate", "preset")],
 )
-def test_deployments_take_a_capture_and_what_is_to_be_done(deployed: str, flow: str, what: str) -> None:
+def test_deployments_accept_a_capture_and_a_preset_or_study(deployed: str, flow: str, what: str) -> None:
     before, parameters = unfinished_runs(), {"capture": "/recordings/ada", what: "mine"}
     run_deployment(f"{flow}/local", parameters=parameters, timeout=0)
     (run,) = runs_of(flow)
@@ -64,7 +64,7 @@ def test_deployments_take_a_capture_and_what_is_to_be_done(deployed: str, flow: 
     assert unfinished_runs() == before + (flow == "train-subject")
 
 
-def test_forms_of_all_deployments_help_with_every_parameter(deployed: str) -> None:
+def test_every_parameter_of_every_deployment_has_a_description(deployed: str) -> None:
     with get_client(sync_client=True) as client:
         found = {one.entrypoint: one for one in client.read_deployments()}
     assert len(found) == 5
@@ -76,12 +76,12 @@ def test_forms_of_all_deployments_help_with_every_parameter(deployed: str) -> No
     assert (watch["max_unfinished"]["minimum"], watch["max_unfinished"]["maximum"]) == (1, 1000)
 
 
-def test_values_out_of_range_are_refused_before_there_is_a_run(deployed: str) -> None:
+def test_values_out_of_range_are_refused_before_a_run_is_created(deployed: str) -> None:
     with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
         run_deployment("ingest-captures/local", parameters={"folder": "captures", "max_unfinished": 0}, timeout=0)
 
 
-def test_a_crashed_run_is_begun_again_a_few_times_and_then_fails(deployed: str) -> None:
+def test_a_crashed_run_is_restarted_a_few_times_and_then_fails(deployed: str) -> None:
     run = run_deployment("train-subject/local", parameters={"capture": "/recordings/bob"}, timeout=0)
     with get_client(sync_client=True) as client:
         for _ in range(2):
@@ -97,9 +97,7 @@ def test_a_crashed_run_is_begun_again_a_few_times_and_then_fails(deployed: str) 
         assert restart_crashed(max_restarts=2) == []
 
 
-def test_more_runs_than_the_server_gives_at_once_are_all_counted(
-    deployed: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_beyond_one_page_of_the_server_are_counted(deployed: str, monkeypatch: pytest.MonkeyPatch) -> None:
     before = unfinished_runs()
     monkeypatch.setattr(restart, "PAGE", 2)
     begun = [run_deployment("train-subject/local", parameters={"capture": f"/{n}"}, timeout=0) for n in range(5)]
@@ -111,15 +109,15 @@ def test_more_runs_than_the_server_gives_at_once_are_all_counted(
     assert {run.id for run in begun} <= set(crashed) and len(crashed) == len(set(crashed))  # type: ignore[union-attr]
 
 
-def test_parameters_are_checked_before_there_is_a_run(deployed: str) -> None:
+def test_parameters_are_validated_before_a_run_is_created(deployed: str) -> None:
     with pytest.raises(PrefectHTTPStatusError, match=r"409|422") as refused:
         run_deployment("train-subject/local", parameters={"capture": "/a", "overrides": 3}, timeout=0)
     assert "overrides" in refused.value.response.text
 
 
 @pytest.mark.parametrize("pool", ["docker", "kubernetes"])
-def test_one_word_moves_all_but_the_watch_into_a_pool_of_containers(prefect_api: str, pool: str) -> None:
-    """The server takes the pool's template."""
+def test_one_changed_word_moves_all_flows_but_the_watch_to_a_container_pool(prefect_api: str, pool: str) -> None:
+    """The server accepts the pool's template, too."""
     moved = yaml.safe_load((ROOT / "prefect.yaml").read_text().replace("&pool local", f"&pool {pool}"))
     pools = {one["flow_name"]: one["work_pool"]["name"] for one in moved["deployments"]}
     assert pools.pop("ingest-captures") == "local"

@@ -1,4 +1,4 @@
-"""Commands that are told to end, and commands whose streams are closed or full."""
+"""Commands that receive SIGTERM, and commands whose streams are closed or full."""
 
 import os
 import signal
@@ -31,8 +31,8 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_sigterm_is_one_line_and_leaves_nothing_half_written(tmp_path: Path) -> None:
-    """Also once pycolmap is loaded, which takes the signal for a crash."""
+def test_sigterm_prints_one_line_and_leaves_no_partial_files(tmp_path: Path) -> None:
+    """Also with pycolmap loaded, which would report the signal as a crash."""
     command = [sys.executable, "-c", ENDED_MIDWAY, "synth", str(tmp_path / "ada")]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (143, "hnerf: ended by SIGTERM\n")
@@ -40,9 +40,11 @@ def test_sigterm_is_one_line_and_leaves_nothing_half_written(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
-def test_a_signal_that_python_drops_comes_again(number: signal.Signals, raised: type[BaseException]) -> None:
+def test_a_signal_during_a_weak_reference_callback_is_not_lost(
+    number: signal.Signals, raised: type[BaseException]
+) -> None:
     class Referred:
-        """What a weak reference can point to."""
+        """An object that a weak reference can point to."""
 
     referred = Referred()
     reference = weakref.ref(referred, lambda _: signal.raise_signal(number))
@@ -52,7 +54,7 @@ def test_a_signal_that_python_drops_comes_again(number: signal.Signals, raised: 
     assert reference() is None and found.type is raised
 
 
-def test_a_second_sigterm_does_not_end_what_cleans_up(tmp_path: Path) -> None:
+def test_a_second_sigterm_does_not_interrupt_the_clean_up(tmp_path: Path) -> None:
     cleaned = []
     with pytest.raises(Terminated), unwound_by_sigterm():
         try:
@@ -63,7 +65,7 @@ def test_a_second_sigterm_does_not_end_what_cleans_up(tmp_path: Path) -> None:
     assert cleaned == [tmp_path]
 
 
-def test_what_sigterm_did_before_it_does_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_former_sigterm_handler_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     during = []
     monkeypatch.setattr(
         synthetic, "write_synthetic_capture", lambda *_: during.append(signal.getsignal(signal.SIGTERM))
@@ -87,7 +89,7 @@ def test_what_sigterm_did_before_it_does_again(tmp_path: Path, monkeypatch: pyte
         ("settings --presets best 2>/dev/full", 0, 2),
     ],
 )
-def test_closed_streams_change_neither_what_is_done_nor_the_exit_code(
+def test_closed_streams_change_neither_the_work_nor_the_exit_code(
     arguments: str, lines: int, status: int, tmp_path: Path
 ) -> None:
     ended = from_shell(arguments, tmp_path)
@@ -95,26 +97,26 @@ def test_closed_streams_change_neither_what_is_done_nor_the_exit_code(
 
 
 @pytest.mark.parametrize("arguments", ["--help", "settings", "models"])
-def test_standard_output_without_room_is_one_line_and_exit_code_1(arguments: str, tmp_path: Path) -> None:
+def test_the_error_of_a_full_standard_output_is_one_line_with_exit_code_1(arguments: str, tmp_path: Path) -> None:
     ended = from_shell(f"{arguments} >/dev/full", tmp_path)
     assert ended.stderr.startswith("hnerf: [Errno 28] No space left") and ended.stderr.count("\n") == 1
     assert ended.returncode == 1
 
 
-def test_help_that_nobody_reads_is_exit_code_1(tmp_path: Path) -> None:
+def test_help_into_a_closed_pipe_has_exit_code_1(tmp_path: Path) -> None:
     ended = from_shell("--help | true; exit ${PIPESTATUS[0]}", tmp_path)
     assert (ended.stderr, ended.returncode) == ("", 1)
 
 
 def from_shell(arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a command whose arguments and streams a shell reads; it buffers its output, as it does by default."""
+    """Run `hnerf` with arguments and redirections for bash; its output is buffered, as by default."""
     command = ["bash", "-c", f'"$0" -c "$1" {arguments}', sys.executable, RUN]
     buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, env=buffered)
 
 
-def test_no_file_takes_the_number_of_a_closed_stream(tmp_path: Path) -> None:
-    """Libraries write to standard output and error by these numbers."""
+def test_no_file_gets_the_descriptor_of_a_closed_stream(tmp_path: Path) -> None:
+    """Libraries write to standard output and error by file descriptor number (1 and 2)."""
     code = "import sys; from flows import ending; ending.open_closed_streams(); sys.exit(open(sys.executable).fileno())"
     ended = subprocess.run(["sh", "-c", 'exec "$0" -c "$1" >&- 2>&-', sys.executable, code], check=False)
     assert ended.returncode > 2

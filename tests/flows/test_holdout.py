@@ -1,4 +1,4 @@
-"""Fields trained without a camera: the inputs of their fit and training, and their scores."""
+"""Fields trained with one camera held out: the inputs of their fit and training, and their scores."""
 
 import dataclasses
 import inspect
@@ -26,13 +26,13 @@ HELD_OUT = ["evaluation.holdout=each"]
 
 
 def write_three(out: Path) -> None:
-    """Write the recording by hand, with all its cameras for training."""
+    """Write the recording of tests/study/recording.py, with all of its cameras for training."""
     dataclasses.replace(write_recording(out), train_cameras=CAMERAS, test_cameras=()).save()
 
 
 @pytest.fixture
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Record every call of a stage that did work: its name and inputs. Only the stage that takes cameras out is
+    """Return the list of stage calls that did work: name and inputs of each. Only the stage that removes cameras is
     real."""
     made: list[dict[str, Any]] = []
 
@@ -67,55 +67,55 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any
     return made
 
 
-def of(calls: list[dict[str, Any]], stage: str) -> list[dict[str, Any]]:
+def of_stage(calls: list[dict[str, Any]], stage: str) -> list[dict[str, Any]]:
     return [call for call in calls if call["stage"] == stage]
 
 
-def test_a_camera_left_out_never_reaches_fit_masks_or_training(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_a_held_out_camera_never_reaches_fit_masks_or_training(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", ["evaluation.holdout='02'"])
     for stage, times in (("segmentation", 2), ("fit", 4), ("training", 2)):  # once with all cameras, once without
-        assert len(of(calls, stage)) == times
-        evaluate_without_camera = [call for call in of(calls, stage) if call["recording"].stage == "subset"]
-        assert len(evaluate_without_camera) == times // 2
-        for call in evaluate_without_camera:
+        assert len(of_stage(calls, stage)) == times
+        without_camera = [call for call in of_stage(calls, stage) if call["recording"].stage == "subset"]
+        assert len(without_camera) == times // 2
+        for call in without_camera:
             assert calibrated_capture(call["recording"], call["calibration"]).train_cameras == ("01", "03")
             root = call["recording"].root
             assert not [path for path in root.rglob("*") if "02" in path.relative_to(root).parts or path.stem == "02"]
             assert Capture.load(root).keypoints("02") is None
-    whole, left = of(calls, "training")
+    whole, left = of_stage(calls, "training")
     assert whole["recording"].stage == "capture"
     assert {left[name].root for name in ("segmentation", "body")}.isdisjoint(
         whole[name].root for name in ("segmentation", "body")
     )
 
 
-def test_a_camera_left_out_is_scored_with_the_masks_of_the_whole_run(
+def test_a_held_out_camera_is_scored_with_the_masks_of_the_full_run(
     calls: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", ["evaluation.holdout='02'"])
-    (scored,), (whole, left) = of(calls, "holdout"), of(calls, "training")
+    (scored,), (whole, left) = of_stage(calls, "holdout"), of_stage(calls, "training")
     assert scored["camera"] == "02"
     assert scored["recording"].stage == "capture" and scored["segmentation"] == whole["segmentation"]
     assert scored["body"] == left["body"] and scored["body"] != whole["body"]
-    (report,) = of(calls, "evaluation")
+    (report,) = of_stage(calls, "evaluation")
     assert [artifact.stage for artifact in report["held_out"]] == ["holdout"]
 
 
-def test_each_camera_is_left_out_once_and_found_again(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_each_camera_is_held_out_once_and_its_results_are_reused(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", HELD_OUT)
-    assert [call["camera"] for call in of(calls, "holdout")] == list(CAMERAS)
-    assert len(of(calls, "training")) == 4
+    assert [call["camera"] for call in of_stage(calls, "holdout")] == list(CAMERAS)
+    assert len(of_stage(calls, "training")) == 4
     done = len(calls)
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", HELD_OUT)
     assert len(calls) == done
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", ["evaluation.holdout='02'"])
-    assert [call["stage"] for call in calls[done:]] == ["evaluation"]  # the rest is known
+    assert [call["stage"] for call in calls[done:]] == ["evaluation"]  # all others are reused
 
 
-def test_without_the_setting_nothing_is_left_out(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_without_the_setting_no_camera_is_held_out(calls: list[dict[str, Any]], tmp_path: Path) -> None:
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", [])
-    assert len(of(calls, "training")) == 1 and of(calls, "holdout") == []
-    assert of(calls, "evaluation")[0]["held_out"] == ()
+    assert len(of_stage(calls, "training")) == 1 and of_stage(calls, "holdout") == []
+    assert of_stage(calls, "evaluation")[0]["held_out"] == ()
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_without_the_setting_nothing_is_left_out(calls: list[dict[str, Any]], tm
         ("each", CAMERAS[:2], "fewer than 2 of the 2 training cameras would be left"),
     ],
 )
-def test_what_cannot_be_left_out_is_told_once_the_recording_is_read(
+def test_an_impossible_holdout_is_refused_right_after_ingestion(
     calls: list[dict[str, Any]],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -142,7 +142,7 @@ def test_what_cannot_be_left_out_is_told_once_the_recording_is_read(
     assert [call["stage"] for call in calls] == ["capture"]
 
 
-def test_what_calibration_rejects_cannot_be_left_out(
+def test_cameras_that_calibration_rejects_do_not_count_for_the_holdout(
     calls: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def without_03(recording: Artifact, calibration: Artifact) -> Capture:
@@ -151,4 +151,4 @@ def test_what_calibration_rejects_cannot_be_left_out(
     monkeypatch.setattr(module, "calibrated_capture", without_03)
     assert main(["run", str(tmp_path / "ada"), "--store", str(tmp_path / "store"), "--set", HELD_OUT[0]]) == 2
     assert "fewer than 2 of the 2 training cameras" in capsys.readouterr().err
-    assert of(calls, "fit") == []
+    assert of_stage(calls, "fit") == []

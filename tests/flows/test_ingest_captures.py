@@ -31,7 +31,7 @@ def watched(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Record the deployment's runs, without a server."""
+    """Replace the server by a fake; return the list of the runs that were started."""
     asked: list[dict[str, Any]] = []
 
     def run_deployment(name: str, parameters: dict[str, Any], **options: Any) -> SimpleNamespace:
@@ -67,9 +67,9 @@ def test_a_copy_or_a_new_name_is_the_same_capture(watched: Path) -> None:
     assert look(watched) == []
 
 
-def test_a_store_that_was_deleted_trains_again(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Prefect starts nothing for a key that it knows: an interrupted call uses the same key again, a new store
-    another."""
+def test_captures_are_trained_again_after_the_store_was_deleted(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prefect ignores an idempotency key that it knows. A repeated call after an interruption uses the same key, a new
+    store another one."""
     keys: list[str] = []
 
     def run_deployment(*_: Any, idempotency_key: str, **__: Any) -> SimpleNamespace:
@@ -79,7 +79,7 @@ def test_a_store_that_was_deleted_trains_again(watched: Path, monkeypatch: pytes
     monkeypatch.setattr(module, "run_deployment", run_deployment)
     look(watched)
     for record in (watched.parent / "store" / "ingested").iterdir():
-        if record.name != "id":  # as if the machine had gone down before they were written
+        if record.name != "id":  # as if the machine had crashed before these were written
             record.unlink()
     look(watched)
     assert keys[:2] == keys[2:] and len(set(keys)) == 2
@@ -94,15 +94,15 @@ def test_changed_content_is_a_new_capture(watched: Path) -> None:
     assert look(watched) == ["ada"]
 
 
-def test_folders_still_being_written_hidden_and_empty_ones_wait(watched: Path) -> None:
+def test_folders_being_written_and_hidden_or_empty_folders_are_not_started(watched: Path) -> None:
     shutil.copytree(watched / "ada", watched / ".incoming")
     (watched / "empty").mkdir()
     assert look(watched, settle_s=1000.0) == []
     assert look(watched) == ["ada", "bob"]
 
 
-def test_a_copy_under_way_with_a_hidden_name_waits(watched: Path) -> None:
-    """rsync writes beside the file's own name."""
+def test_a_capture_with_a_hidden_partial_file_waits(watched: Path) -> None:
+    """rsync writes to a hidden temporary name."""
     for path in [*watched.rglob("*")]:
         os.utime(path, (0, 0))
     (watched / "bob" / "images" / ".1.jpg.Xa81fQ").write_text("half")
@@ -114,7 +114,7 @@ def test_a_copy_under_way_with_a_hidden_name_waits(watched: Path) -> None:
     assert look(watched, settle_s=0.5) == ["bob"]
 
 
-def test_a_name_that_is_not_utf_8_and_a_deep_folder_are_noted_and_the_others_go_on(watched: Path) -> None:
+def test_a_name_that_is_not_utf_8_or_a_deep_folder_does_not_block_other_captures(watched: Path) -> None:
     shutil.copytree(watched / "ada", watched / os.fsdecode(b"a\xff"))
     (watched / "deep").mkdir()
     at = os.open(watched / "deep", os.O_RDONLY)
@@ -131,7 +131,7 @@ def test_a_name_that_is_not_utf_8_and_a_deep_folder_are_noted_and_the_others_go_
     assert sorted(path.name for path in (watched / ".refused").iterdir()) == [os.fsdecode(b"a\xff.txt")]
 
 
-def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
+def test_an_unreadable_capture_is_logged_and_the_others_are_started(
     watched: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def unreadable(capture: Path) -> Any:
@@ -149,7 +149,7 @@ def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
 def test_a_refused_capture_is_noted_until_it_is_changed_or_removed(
     watched: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The captures themselves stay where they are."""
+    """The captures themselves are not moved."""
     for name in ("ada", "bob"):
         (watched / name / "images" / "locked").mkdir()
     noted = watched / ".refused"
@@ -176,7 +176,7 @@ def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> N
     (watched / ".refused").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "elsewhere" / "thesis.txt").touch()
     quarantine.clear_removed(watched)
-    (tmp_path / "elsewhere" / "thesis.txt").unlink()  # raises if it is gone
+    (tmp_path / "elsewhere" / "thesis.txt").unlink()  # raises if it is missing
     with pytest.raises(OSError, match="is a symbolic link"):
         quarantine.note(watched / "ada", "refused: x")
     (watched / ".refused").unlink()
@@ -187,7 +187,7 @@ def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> N
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
-def test_a_run_that_was_lost_too_often_is_noted_where_it_was_started_from(
+def test_a_run_that_was_lost_too_often_is_noted_in_its_watched_folder(
     watched: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     look(watched)
@@ -201,9 +201,9 @@ def test_a_run_that_was_lost_too_often_is_noted_where_it_was_started_from(
     assert list(elsewhere.parent.iterdir()) == [elsewhere]  # it was not started from a watched folder
 
 
-def test_a_run_that_fails_is_noted_where_it_was_started_from(watched: Path, prefect_api: str) -> None:
+def test_a_failed_run_is_noted_in_its_watched_folder(watched: Path, prefect_api: str) -> None:
     store = watched.parent / "store"
-    for expected in ([], ["ada.txt"]):  # before and after it is started from the folder
+    for expected in ([], ["ada.txt"]):  # before and after the watch has started it
         with pytest.raises(InputError):
             train_subject(watched / "ada", store=store)
         assert sorted(path.name for path in watched.glob(".refused/*")) == expected
@@ -212,15 +212,15 @@ def test_a_run_that_fails_is_noted_where_it_was_started_from(watched: Path, pref
     assert text.startswith(f"ada: refused: {watched / 'ada'}: ") and "(flow run " in text
 
 
-def test_nothing_is_started_where_the_disk_is_nearly_full(
+def test_nothing_is_started_if_the_disk_is_nearly_full(
     watched: Path, runs: list[dict[str, Any]], caplog: pytest.LogCaptureFixture
 ) -> None:
     full = ingest_captures.fn(watched, "demo", watched.parent / "store", 0.0, min_free_gib=1e9)
     assert full == runs == [] and "nothing is started" in caplog.text
 
 
-def test_a_look_at_many_known_folders_is_quick(watched: Path) -> None:
-    """A hundred folders; a thousand take ten times as long (docs/reliability.md)."""
+def test_checking_many_known_folders_is_quick(watched: Path) -> None:
+    """For a hundred folders; a thousand take ten times as long (docs/reliability.md)."""
     for i in range(98):
         (watched / f"c{i}").mkdir()
         for j in range(10):
@@ -234,17 +234,17 @@ def test_a_look_at_many_known_folders_is_quick(watched: Path) -> None:
 def test_a_folder_renamed_while_its_run_waits_is_trained_under_its_new_name(
     watched: Path, runs: list[dict[str, Any]]
 ) -> None:
-    """The waiting run does not find its folder, and frees what it was started for; the other is not started again."""
+    """The waiting run does not find its folder, and releases the capture; the other capture is not started again."""
     look(watched)
     (watched / "ada").rename(watched / "eve")
-    assert look(watched) == []  # whether that run has begun is not known yet
+    assert look(watched) == []  # it is not known yet whether that run has begun
     with pytest.raises(InputError, match="ada: no such folder"):
         train_subject.fn(Path(runs[0]["capture"]), "demo", watched.parent / "store")
     assert look(watched) == ["eve"]
     assert runs[-1]["capture"] == str(watched / "eve") and look(watched) == []
 
 
-def test_no_more_is_started_than_may_wait(
+def test_no_more_runs_are_started_than_the_limit(
     watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for i in range(5):
@@ -253,12 +253,12 @@ def test_no_more_is_started_than_may_wait(
     monkeypatch.setattr(module, "unfinished_runs", lambda: len(runs))
     assert look(watched, max_unfinished=3) == ["ada", "bob", "new0"]
     assert look(watched, max_unfinished=3) == []
-    del runs[:2]  # they have ended
+    del runs[:2]  # these have ended
     assert look(watched, max_unfinished=3) == ["new1", "new2"]
 
 
-def test_what_waits_is_not_read(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every look would read it again, which takes minutes."""
+def test_captures_beyond_the_limit_are_not_read(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise every look would read it again, which takes minutes."""
     reads = Mock(side_effect=read_capture)
     monkeypatch.setattr(module, "read_capture", reads)
     monkeypatch.setattr(module, "unfinished_runs", lambda: 2)
@@ -278,7 +278,7 @@ def test_names_that_are_not_utf_8_are_captures_too(watched: Path) -> None:
     assert look(watched) == ["ada", "bob"]
 
 
-def test_what_could_not_be_started_is_tried_at_the_next_look(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_start_is_repeated_at_the_next_look(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         broken.setattr(module, "run_deployment", Mock(side_effect=ConnectionError("no server")))
         with pytest.raises(ConnectionError):
@@ -288,7 +288,7 @@ def test_what_could_not_be_started_is_tried_at_the_next_look(watched: Path, monk
 
 @pytest.fixture
 def bucket(s3: str, tmp_path: Path) -> str:
-    """URL of a folder with the captures ada and bob."""
+    """Return the URL of a folder in a bucket with the captures ada and bob."""
     url = f"{s3}-{tmp_path.name}"
     for name in ("ada", "bob"):
         filesystem("s3").pipe(f"{url}/{name}/a.mp4", name.encode())
@@ -296,7 +296,7 @@ def bucket(s3: str, tmp_path: Path) -> str:
 
 
 def test_captures_in_a_bucket_are_started_by_their_url(bucket: str, tmp_path: Path, runs: list[dict[str, Any]]) -> None:
-    """A listing must stand still before it is started. Copies are known, and what changes is another capture."""
+    """A capture starts once its listing has stopped changing. A copy is the same capture, changed content a new one."""
     fs, store = filesystem("s3"), tmp_path / "store"
     assert ingest_captures.fn(bucket, "demo", store, 60.0) == []
     (waiting, _) = (store / "ingested").glob("new-*")
@@ -312,7 +312,7 @@ def test_captures_in_a_bucket_are_started_by_their_url(bucket: str, tmp_path: Pa
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada"]
 
 
-def test_a_capture_that_left_the_bucket_is_started_from_where_it_lies(bucket: str, tmp_path: Path) -> None:
+def test_a_capture_moved_within_the_bucket_is_started_from_its_new_url(bucket: str, tmp_path: Path) -> None:
     store = tmp_path / "store"
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
     filesystem("s3").mv(f"{bucket}/ada/a.mp4", f"{bucket}/adele/a.mp4")
@@ -321,7 +321,7 @@ def test_a_capture_that_left_the_bucket_is_started_from_where_it_lies(bucket: st
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["adele"]
 
 
-def test_a_worker_that_is_not_let_in_does_not_start_a_capture_again(
+def test_a_run_without_access_to_the_bucket_does_not_restart_the_capture(
     bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = tmp_path / "store"

@@ -1,4 +1,4 @@
-"""The commands that docs/operations.md gives for PostgreSQL, against a server of this test's own: make soak."""
+"""The commands for PostgreSQL in docs/operations.md, on a temporary server (only in `make soak`)."""
 
 import subprocess
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.soak, pytest.mark.skipif(not BINARIES, reason="Debian'
 
 @pytest.fixture
 def cluster() -> Iterator[dict[str, str]]:
-    """Start an empty PostgreSQL; return the environment in which its administrator's commands run."""
+    """Start an empty PostgreSQL; yield the environment for its administrator's commands."""
     with postgresql.cluster() as environment:
         yield environment
 
@@ -29,13 +29,13 @@ def shell(command: str, environment: dict[str, str], folder: Path) -> str:
 
 
 def serve(environment: dict[str, str], folder: Path, commands: list[str]) -> str:
-    """Run commands against a Prefect server on the database; return what they printed."""
+    """Run commands with a Prefect server on the database; return their output."""
     with prefect_server(PATIENCE_S, environment, folder) as url:
         return "".join(shell(command, environment | {"PREFECT_API_URL": url}, folder) for command in commands)
 
 
 def test_set_up_upgrade_backup_and_restore(cluster: dict[str, str], tmp_path: Path) -> None:
-    """A work pool made before the backup is there after the restore, one made later is not."""
+    """After the restore, a work pool made before the backup exists, and one made later does not."""
     environment = cluster | {"PREFECT_HOME": str(tmp_path), "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
     shell("createuser hnerf && createdb hnerf --owner hnerf", environment, tmp_path)
     url = f"postgresql+asyncpg://hnerf:PASSWORD@localhost:{cluster['PGPORT']}/hnerf"

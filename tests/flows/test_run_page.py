@@ -19,7 +19,7 @@ from hnerf.errors import InputError
 from hnerf.progress import Progress, report
 
 
-def test_progress_and_links_are_on_the_page_of_the_run(
+def test_the_page_of_a_run_shows_progress_and_links(
     prefect_api: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_page, "UPDATE_S", 0.05)
@@ -32,7 +32,7 @@ def test_progress_and_links_are_on_the_page_of_the_run(
             for done in (1, 2):
                 time.sleep(0.1)
                 report("body fit", done, 8)
-        report("body fit", 8, 8)  # nobody looks any more
+        report("body fit", 8, 8)  # no longer shown
         publish_link(tmp_path / "report.html", "report", "Report")
         context = FlowRunContext.get()
         return str(context.flow_run.id) if context and context.flow_run else ""
@@ -47,9 +47,7 @@ def test_progress_and_links_are_on_the_page_of_the_run(
 
 
 @pytest.mark.parametrize("study", [ablate, benchmark, stability])
-def test_studies_show_how_far_they_have_come(
-    study: Flow[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_studies_show_their_progress(study: Flow[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def read(*_: Path) -> None:
         report("ingestion", 1, 2)
         raise InputError("enough")
@@ -63,7 +61,7 @@ def test_studies_show_how_far_they_have_come(
     shown.assert_called_once_with(Progress("ingestion", 1, 2))
 
 
-def test_a_server_that_is_away_ends_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_server_does_not_end_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_page, "create_progress_artifact", Mock(side_effect=ConnectionError("no server")))
     page = run_page._ProgressPage()
     page.next_s["fit"] = 0.0
@@ -78,5 +76,5 @@ def test_pictures_are_shrunk_and_embedded(tmp_path: Path) -> None:
     assert Image.open(io.BytesIO(base64.b64decode(uri))).size == (640, 160)
 
 
-def test_keys_are_letters_digits_and_dashes() -> None:
+def test_keys_contain_only_letters_digits_and_dashes() -> None:
     assert [slug(text) for text in ("Body fit", "camera Ä_1", "...")] == ["body-fit", "camera-1", "work"]

@@ -1,4 +1,4 @@
-"""Who may ask the Prefect server, with the settings that this repository has."""
+"""Access to the Prefect server with the settings of this repository."""
 
 import asyncio
 import os
@@ -18,8 +18,8 @@ PATH = "/api/admin/version"
 
 
 def ask(method: str, headers: dict[str, str], auth: tuple[str, str] | None = None) -> httpx.Response:
-    """Return the answer of a server with the origins of prefect.toml and a password, without starting one."""
-    from prefect.server.api.server import create_app  # takes seconds, which only the worker that asks should spend
+    """Return the response of a server app with the origins of prefect.toml and a password; no server is started."""
+    from prefect.server.api.server import create_app  # takes seconds, so only the workers that need it import it
 
     settings = tomllib.loads((ROOT / "prefect.toml").read_text())
     origins = settings["server"]["api"]["cors_allowed_origins"]
@@ -35,27 +35,27 @@ def ask(method: str, headers: dict[str, str], auth: tuple[str, str] | None = Non
         return asyncio.run(answer())
 
 
-def test_without_the_password_nothing_is_answered() -> None:
+def test_requests_without_the_password_are_refused() -> None:
     assert ask("GET", {}).status_code == 401
     assert ask("GET", {}, ("hnerf", "guess")).status_code == 401
     assert ask("GET", {}, ("hnerf", "secret")).status_code == 200
 
 
 @pytest.mark.parametrize(("origin", "allowed"), [("http://127.0.0.1:4200", True), ("http://elsewhere.example", False)])
-def test_only_the_servers_own_pages_may_ask(origin: str, allowed: bool) -> None:
+def test_only_the_servers_own_pages_may_send_requests(origin: str, allowed: bool) -> None:
     asked = {"Origin": origin, "Access-Control-Request-Method": "POST"}
     assert ("access-control-allow-origin" in ask("OPTIONS", asked).headers) == allowed
 
 
-def test_each_installation_has_a_password_of_its_own() -> None:
+def test_each_installation_has_its_own_password() -> None:
     one, two = ([line.partition("=") for line in environment().splitlines()] for _ in range(2))
     assert tuple(name for name, _, _ in one) == NAMES
     (password,) = {value for _, _, value in one}
     assert len(password) > 30 and password != two[0][2]
 
 
-def test_an_installation_that_ended_before_it_wrote_the_password_writes_it(tmp_path: Path) -> None:
-    """The shell makes the file before the program begins; a server with an empty one asks for no password."""
+def test_an_interrupted_installation_writes_the_password_when_repeated(tmp_path: Path) -> None:
+    """The shell creates the file before the program runs; with an empty file, a server would need no password."""
     (line,) = [line for line in (ROOT / "Makefile").read_text().splitlines() if "flows.server_password" in line]
     command = line.replace("$(BIN)/python", sys.executable)
     (tmp_path / ".env").touch()

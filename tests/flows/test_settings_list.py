@@ -31,8 +31,8 @@ class Scene(Section):
     floor: Path | None = None  # a picture; None: grey
 
 
-def test_no_setting_is_wrapped_before_its_comment() -> None:
-    """The list takes a comment from the line on which the setting begins."""
+def test_every_setting_has_its_comment_on_its_first_line() -> None:
+    """`settings_list` reads the comment from the first line of the setting."""
     wrapped = re.findall(r"^    (\w+): .*\($", Path(config.__file__).read_text(), re.MULTILINE)
     assert wrapped == []
 
@@ -57,7 +57,7 @@ def test_the_command_lists_a_preset(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("settings", [load_settings("fast"), load_settings("paper"), SyntheticSettings()])
-def test_every_setting_is_listed_as_set_takes_it(settings: Settings | SyntheticSettings) -> None:
+def test_every_setting_is_listed_in_the_syntax_of_set(settings: Settings | SyntheticSettings) -> None:
     assigned = [line.partition("  ")[0] for line in settings_list(settings)]
     assert len(assigned) == _leaves(settings)
     assert overridden(settings, assigned) == settings

@@ -1,4 +1,4 @@
-"""The stages that get degraded inputs, and the verdicts on runs that break; stages are fake."""
+"""The stability flow with fake stages: which stages get degraded inputs, and the verdicts on failing runs."""
 
 import base64
 import json
@@ -34,10 +34,10 @@ degradations:
 
 @pytest.fixture
 def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Replace every stage by one that names its input; the list collects each training's inputs.
+    """Replace every stage by a fake that names its input; return the list that collects the inputs of each training.
 
-    Noise of 40 is refused by calibration; eroded masks crash the training; pose noise loses 2 dB; the surface breaks in
-    poses of 60 degrees.
+    Calibration refuses noise of 40; eroded masks crash the training; pose noise costs 2 dB; the surface breaks in poses
+    of 60 degrees.
     """
     trained: list[dict[str, Any]] = []
 
@@ -65,9 +65,9 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
 
     def evaluate(_: Any, truth: Any, recording: Any, cameras: Any, masks: Any, body: Any, model: Any, __: Any) -> Any:
         assert truth == ("of skirt 0.02" if recording.name == "skirt 0.02" else "true")
-        assert body.name == "body"  # whose novel poses are shown, though others were trained on
+        assert body.name == "body"  # novel poses come from the undegraded body, even if training used another
         psnr = 28.0 if "pose_noise 2" in model.name else 30.0
-        late = recording.name == "image_noise 5"  # which has easy images of its own
+        late = recording.name == "image_noise 5"  # this run has an extra, easy image
         views = {1: psnr + 2, 3: psnr - 2} if not late else {1: 32.0, 4: 99.0}
         images = [{"camera": "c", "frame": f, "psnr": db, "ssim": 0.9, "empty_psnr": 18.0} for f, db in views.items()]
         surfaces = [{"frame": 1, "chamfer_mm": 6.0}, {"frame": 4, "chamfer_mm": 1.0}][: 1 + late]
@@ -111,7 +111,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         "show_in_extreme_poses": show,
     }
     for name, stage in replaced.items():
-        for place in (module, benchmark, train_subject):  # which `ingest_part` and `prepare_training` are of
+        for place in (module, benchmark, train_subject):  # `ingest_part` and `prepare_training` are in the other two
             if hasattr(place, name):
                 monkeypatch.setattr(place, name, stage)
     capture = SimpleNamespace(name="ada", test_cameras=("c",), novel_pose_frames=(1, 3, 4))
@@ -156,7 +156,7 @@ def test_every_run_has_a_verdict(tmp_path: Path) -> None:
     assert charts == {"ada-mine-matrix.png", "ada-mine-psnr.png", "ada-mine-chamfer_mm.png"}
 
 
-def test_a_field_without_a_surface_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_without_a_surface_has_the_verdict_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     evaluate = module.evaluate
 
     def evaluate_mist(*inputs: Any) -> Any:
@@ -173,9 +173,9 @@ def test_a_field_without_a_surface_failed(tmp_path: Path, monkeypatch: pytest.Mo
     assert (run["verdict"], run["reason"]) == ("failed", "signed distance field: not finite; training diverged")
 
 
-def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(tmp_path: Path) -> None:
-    """Compare the noisy run in frame 1 only, where both have 32 dB and 6 mm; the good run's mean of both frames is
-    30."""
+def test_runs_are_compared_on_the_images_and_surfaces_that_both_have(tmp_path: Path) -> None:
+    """The noisy run is compared in frame 1 only, where both runs have 32 dB and 6 mm; the good run's mean over its two
+    frames is 30 dB."""
     good, noisy = study(tmp_path, only=["image_noise"])["runs"][:2]
     assert (good["psnr"], good["images"], good["chamfer_mm"], good["surfaces"]) == (30.0, 2, 6.0, 1)
     assert (noisy["psnr"], noisy["images"], noisy["chamfer_mm"], noisy["surfaces"]) == (32.0, 1, 6.0, 1)
@@ -185,7 +185,7 @@ def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(tmp_path: P
     assert "| ok | 32.00 (+0.00) | 32.50 (+0.00) | 33.00 (+0.00) | 0.900 (+0.000) | 6.00 (+0.00) |" in table
 
 
-def test_the_flow_runs_page_shows_the_charts_themselves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_of_the_flow_run_embeds_the_charts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
     monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
     monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
@@ -196,7 +196,7 @@ def test_the_flow_runs_page_shows_the_charts_themselves(tmp_path: Path, monkeypa
     assert ".png)" not in text
 
 
-def test_what_a_capture_does_not_allow_is_left_out_and_no_verdict(
+def test_a_degradation_that_does_not_apply_is_left_out_without_a_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "degrade_masks", Mock(side_effect=NotApplicableError("ada: has no keypoints")))
@@ -212,7 +212,7 @@ def test_without_test_cameras_images_are_not_compared(tmp_path: Path, monkeypatc
     assert [(run["psnr"], run["chamfer_mm"], run["verdict"]) for run in runs[:2]] == [(None, 6.0, "ok")] * 2
 
 
-def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_each_degradation_changes_the_input_of_its_own_stage(stages: list[dict[str, Any]], tmp_path: Path) -> None:
     study(tmp_path)
     inputs = [(s["recording"], s["masks"], s["body"]) for s in stages if s["settings"].seed == 0]
     good = ("capture", "masks", "body")
@@ -223,14 +223,14 @@ def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], t
         ("capture", "mask_eroded 1", "body"),
         ("capture", "masks", "pose_noise 2"),
         good,  # learning rate
-        good,  # extreme poses, the store has this training already
+        good,  # extreme poses; the real store already has this training
         good,
     ]
     rates = [s["settings"].field.network_learning_rate for s in stages if s["settings"].seed == 0]
     assert rates == pytest.approx([0.01, 0.01, 0.01, 0.01, 0.01, 0.1, 0.01, 0.01])
 
 
-def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
+def test_a_method_that_refuses_the_capture_is_tried_once_per_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "train", Mock(side_effect=InputError("NeRF models one moment; choose one frame")))
@@ -239,12 +239,10 @@ def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
     assert "NeRF models one moment" in runs[0]["reason"]
 
 
-def test_further_seeds_try_what_is_near_a_border_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_border_seeds_repeat_only_runs_near_a_border(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = STUDY.replace("seeds: [0, 1]", "seeds: [0]\nborder_seeds: [3, 4]")
     (tmp_path / "mine.yaml").write_text(text)
-    runs = study(tmp_path, only=["pose_noise", "image_noise"])["runs"]  # 2 dB are near no border
+    runs = study(tmp_path, only=["pose_noise", "image_noise"])["runs"]  # 2 dB is not near a border
     assert {run["seed"] for run in runs} == {0}
     monkeypatch.setattr("hnerf.study.stability.verdict.DEGRADED_DB", 2.2)
     runs = study(tmp_path, only=["pose_noise", "image_noise"])["runs"]
@@ -256,7 +254,7 @@ def test_further_seeds_try_what_is_near_a_border_and_nothing_else(
     ]
 
 
-def test_a_part_stands_for_the_capture(
+def test_a_study_of_a_part_uses_only_that_part_of_the_capture(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = module.Capture.load(tmp_path)
@@ -275,7 +273,7 @@ def test_a_part_stands_for_the_capture(
     assert "the capture outside this part: frames 1, novel_poses False" in found["left_out"]
 
 
-def test_bad_input_in_evaluation_is_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_input_in_evaluation_has_the_verdict_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "evaluate", Mock(side_effect=InputError("no surface in its box")))
     assert {r["verdict"] for r in study(tmp_path, only=["pose_noise"])["runs"]} == {"failed"}
 
@@ -284,7 +282,7 @@ def test_bad_input_in_evaluation_is_failure(tmp_path: Path, monkeypatch: pytest.
     "error",
     [LostWorkerError("rank 0 was killed"), OSError(28, "No space left on device"), PlaceError("s3://b: closed")],
 )
-def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
+def test_errors_of_the_machine_end_the_command_and_finished_runs_are_kept(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "degrade_fit", Mock(side_effect=error))
@@ -296,7 +294,7 @@ def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
     assert "![ada-mine-matrix.png]" in table.read_text()
 
 
-def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
+def test_an_interruption_of_the_first_run_leaves_an_earlier_study_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     earlier = study(tmp_path, only=["pose_noise"])
@@ -308,14 +306,14 @@ def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
     assert "degraded at 2" in (folder / "ada-mine-part.md").read_text()
 
 
-def test_the_table_of_another_capture_of_the_name_stays(tmp_path: Path) -> None:
+def test_the_table_of_another_capture_with_the_same_name_is_kept(tmp_path: Path) -> None:
     earlier = study(tmp_path, only=["pose_noise"])
     with pytest.raises(InputError, match=f"ada-mine-part.md: is of {tmp_path}, not of {tmp_path}/other; give one"):
         stability.fn(tmp_path / "other", str(tmp_path / "mine.yaml"), tmp_path / "store", only=["skirt"])
     assert json.loads((tmp_path / "store" / "stability" / "ada-mine-part.json").read_text()) == earlier
 
 
-def test_a_chart_that_cannot_be_drawn_hides_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_a_chart_does_not_hide_the_error_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "degrade_fit", Mock(side_effect=LostWorkerError("rank 0 was killed")))
     monkeypatch.setattr(module, "matrix_chart", Mock(side_effect=ValueError("no ink")))
     with pytest.raises(LostWorkerError):
@@ -323,24 +321,24 @@ def test_a_chart_that_cannot_be_drawn_hides_nothing(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("part", [{"only": ["pose_noise"]}, {"methods": ["demo"]}], ids=str)
-def test_a_part_of_a_study_leaves_the_whole_one_as_it_was(tmp_path: Path, part: dict[str, list[str]]) -> None:
+def test_running_a_part_leaves_the_files_of_the_whole_study_unchanged(
+    tmp_path: Path, part: dict[str, list[str]]
+) -> None:
     study(tmp_path)
     files = {path: path.read_bytes() for path in (tmp_path / "store" / "stability").iterdir()}
     study(tmp_path, **part)
     assert {path: path.read_bytes() for path in files} == files
 
 
-def test_charts_of_an_earlier_call_go(tmp_path: Path) -> None:
-    """Run poses that are judged by surfaces alone, which have no curves."""
+def test_outdated_charts_of_an_earlier_call_are_removed(tmp_path: Path) -> None:
+    """The second call has only extreme poses, which are judged by surfaces and have no curves."""
     study(tmp_path, only=["pose_noise"])
     study(tmp_path, only=["extreme_poses"])
     charts = {path.name for path in (tmp_path / "store" / "stability").glob("*.png")}
     assert charts == {"ada-mine-part-matrix.png"}
 
 
-def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_reference_run_is_kept_and_ends_its_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
     monkeypatch.setattr(module, "check_meshes", lambda *_: SimpleNamespace(root=tmp_path))
     table = study(tmp_path, only=["pose_noise"])
@@ -350,9 +348,9 @@ def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
     assert "| pose noise, ° a joint | failed at 2 |" in text
 
 
-def test_what_has_no_new_poses_is_judged_on_new_views(tmp_path: Path) -> None:
-    """Nerfies has no novel poses at all; the paper's method has none with one frame, and then nothing in common with
-    the others."""
+def test_methods_without_novel_poses_are_judged_on_novel_views(tmp_path: Path) -> None:
+    """Nerfies has no novel poses at all. The published method has none with one frame, so nothing to compare with its
+    other runs."""
     (tmp_path / "mine.yaml").write_text(
         "methods: [nerfies, paper]\nseeds: [0]\ndegradations: {frames_left: [2, 1], extreme_poses: [45]}"
     )
@@ -378,9 +376,9 @@ def test_the_command_prints_the_table(tmp_path: Path, capsys: pytest.CaptureFixt
     assert f"table: {tmp_path / 'store' / 'stability' / 'ada-mine-part.md'}" in shown
 
 
-def test_a_method_that_is_named_twice_is_one(tmp_path: Path) -> None:
+def test_a_method_that_is_named_twice_is_run_once(tmp_path: Path) -> None:
     table = stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", ["fast", "fast"])
-    assert table.name == "ada-mine.md"  # as the study has it
+    assert table.name == "ada-mine.md"  # as in the study: not a part of it
     assert "| degradation | fast |\n" in table.read_text()
 
 

@@ -18,7 +18,7 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
     return Store(tmp_path / "store")
 
 
-def test_what_is_there_and_whose(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_and_show_name_subjects_and_artifacts(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     store.claim("ada", "a" * 64, Path("/recordings/\x1bada"))
     assert main(["store", "list"]) == 0
     _, ada, total = capsys.readouterr().out.splitlines()
@@ -44,13 +44,13 @@ def test_nothing_is_removed_without_yes(store: Store, capsys: pytest.CaptureFixt
     assert main(["store", "verify"]) == 0
 
 
-def test_damage_is_an_error(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_reports_damage_as_an_error(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     next(store.root.glob("fit/*/deep/letters")).unlink()
     assert main(["store", "verify", "ada"]) == 2
     assert capsys.readouterr().err.startswith("hnerf: store: 1 faults")
 
 
-def test_out_and_in(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_and_import(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["store", "export", "ada"]) == 0
     assert main(["store", "export", "ada"]) == 2  # nothing is overwritten
     assert main(["store", "import", "ada.tar", "--store", "other"]) == 0
@@ -66,14 +66,14 @@ def test_a_folder_that_is_no_store_is_refused(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    thumbnail = tmp_path / "pictures" / "thumbnails" / ("a" * 32)  # is named like an artifact
+    thumbnail = tmp_path / "pictures" / "thumbnails" / ("a" * 32)  # named like an artifact
     thumbnail.mkdir(parents=True)
     assert main(["store", *command.split(), "--store", "pictures"]) == 2
     assert capsys.readouterr().err == "hnerf: pictures: not a store; give its folder with --store\n"
     assert thumbnail.is_dir() and not (tmp_path / "ada.tar").exists()
 
 
-def test_times() -> None:
+def test_durations() -> None:
     assert [duration_s(text) for text in ("30d", "12h", "5m", "7s", "0")] == [2592000, 43200, 300, 7, 0]
     for text in ("30", "d", "-1d", "1w", "1.5d", ""):
         with pytest.raises(ArgumentTypeError):

@@ -19,23 +19,23 @@ def test_systemd_accepts_the_units(tmp_path: Path) -> None:
         paths.append(str(tmp_path / name))
     command = ["systemd-analyze", "verify", "--man=no", *paths]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert str(tmp_path) not in done.stderr, done.stderr  # it complains about units of the machine, too
+    assert str(tmp_path) not in done.stderr, done.stderr  # it may also complain about other units of the machine
     assert "hnerf" not in done.stderr, done.stderr
 
 
-def test_both_come_back_whatever_ends_them() -> None:
+def test_both_services_always_restart() -> None:
     for text in units(Path("/srv/hnerf")).values():
         assert "Restart=always" in text and "StartLimitIntervalSec=0" in text
     assert "Wants=hnerf-server.service" in units(Path("/srv/hnerf"))["hnerf-worker.service"]
 
 
 def test_the_worker_opens_no_port() -> None:
-    """The health check of Prefect's worker listens on port 8080 of every address."""
+    """The health check of Prefect's worker would listen on port 8080 on all addresses."""
     assert "--with-healthcheck" not in units(Path("/srv/hnerf"))["hnerf-worker.service"]
 
 
 @pytest.mark.parametrize("name", ['a"b', "a\\b"])
-def test_a_path_that_systemd_does_not_take_is_one_line(
+def test_the_error_of_a_path_that_systemd_rejects_is_one_line(
     tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "ROOT", Path("/srv") / name)
@@ -45,7 +45,7 @@ def test_a_path_that_systemd_does_not_take_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_they_are_written_into_a_folder_that_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_units_are_written_only_into_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main([str(tmp_path)])
     assert {path.name for path in tmp_path.iterdir()} == set(units(tmp_path))
     with pytest.raises(SystemExit, match="2"):

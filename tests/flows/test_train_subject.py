@@ -1,4 +1,4 @@
-"""The order of the flow, with fake stages that record what they were given."""
+"""The order of the stages in the flow, with fake stages that record their inputs."""
 
 import inspect
 import json
@@ -26,7 +26,7 @@ STAGES = ("ingest", "detect", "find_hands", "calibrate", "segment", "fit", "trai
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write a capture folder and replace every stage of the flow."""
     for name in STAGES:
-        monkeypatch.setattr(module, name, _noting(getattr(module, name), tmp_path))
+        monkeypatch.setattr(module, name, _recording(getattr(module, name), tmp_path))
     monkeypatch.setattr(module, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
     monkeypatch.setattr(module, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
     monkeypatch.setattr(module, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
@@ -34,8 +34,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "ada"
 
 
-def _noting(stage: Stage[Any], tmp_path: Path) -> Stage[Any]:
-    """Return a stage of the same name and inputs that writes down which artifacts it was given."""
+def _recording(stage: Stage[Any], tmp_path: Path) -> Stage[Any]:
+    """Return a fake stage with the same name and parameters, which records its input artifacts."""
 
     def write(out: Path, **inputs: Any) -> dict[str, float]:
         still = load_settings("idr" if (tmp_path / "ada" / "still").exists() else "fast").training
@@ -53,7 +53,7 @@ def given(subject: Path, stage: str) -> list[str]:
     return json.loads((subject / stage / "given.json").read_text())
 
 
-def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path: Path) -> None:
+def test_every_stage_is_linked_and_gets_the_results_of_earlier_stages(folder: Path, tmp_path: Path) -> None:
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert subject == tmp_path / "store" / "subjects" / "ada"
     assert given(subject, "segmentation") == ["capture", "calibration"]
@@ -63,7 +63,7 @@ def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path:
     assert given(subject, "asset") == ["capture", "calibration", "segmentation", "training"]
 
 
-def test_a_field_without_poses_to_set_has_no_asset(
+def test_a_field_that_cannot_be_posed_has_no_asset(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (folder / "still").touch()
@@ -82,7 +82,9 @@ def test_a_capture_in_a_bucket_is_fetched(folder: Path, s3: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(("mark", "stage"), [("undetected", "detection"), ("handed", "hands")])
-def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Path, mark: str, stage: str) -> None:
+def test_later_stages_get_the_detections_in_place_of_the_recording(
+    folder: Path, tmp_path: Path, mark: str, stage: str
+) -> None:
     (folder / mark).touch()
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert given(subject, stage) == ["capture"]
@@ -91,8 +93,8 @@ def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Pa
     assert given(subject, "asset") == [stage, "calibration", "segmentation", "training"]
 
 
-def test_what_a_run_did_without_is_not_shown(folder: Path, tmp_path: Path) -> None:
-    """The recording's own files do not change."""
+def test_stages_that_a_run_skips_are_not_linked(folder: Path, tmp_path: Path) -> None:
+    """The recording's own files are the same in both runs."""
     for name in ("undetected", "handed"):
         (folder / name).touch()
     assert (train_subject.fn(folder, "demo", tmp_path / "store", []).subject / "hands").exists()
@@ -106,7 +108,7 @@ def test_the_store_knows_every_stage_that_a_subject_links_to() -> None:
     assert [getattr(module, name).name for name in STAGES] == list(store.STAGES)
 
 
-def test_without_masks_or_plates_a_rough_fit_comes_first(
+def test_without_masks_or_plates_a_rough_fit_precedes_segmentation(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "bare").touch()
@@ -117,7 +119,7 @@ def test_without_masks_or_plates_a_rough_fit_comes_first(
     assert len(list((tmp_path / "store" / "fit").glob("*/given.json"))) == 2
 
 
-def test_fit_and_segmentation_go_round_until_the_masks_stand_still(
+def test_fit_and_segmentation_alternate_until_the_masks_converge(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "bare").touch()
@@ -129,7 +131,7 @@ def test_fit_and_segmentation_go_round_until_the_masks_stand_still(
     assert len(list((tmp_path / "store" / "segmentation").glob("*/given.json"))) == 2
 
 
-def test_rounds_are_bounded(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_rounds_is_limited(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "bare").touch()
     asked = []
     monkeypatch.setattr(module, "converged", lambda *_: bool(asked.append(1)))
@@ -137,7 +139,7 @@ def test_rounds_are_bounded(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert len(asked) == 2
 
 
-def test_a_run_names_its_own_results_whoever_ends_last(folder: Path, tmp_path: Path) -> None:
+def test_a_run_returns_its_own_results_even_if_another_run_ends_last(folder: Path, tmp_path: Path) -> None:
     first = train_subject.fn(folder, "demo", tmp_path / "store", [])
     second = train_subject.fn(folder, "demo", tmp_path / "store", ["evaluation.report_rows=7"])
     assert first.report != second.report and first.asset == second.asset and first.subject == second.subject
@@ -145,10 +147,10 @@ def test_a_run_names_its_own_results_whoever_ends_last(folder: Path, tmp_path: P
     assert (first.report.parent / "given.json").exists()
 
 
-def test_hands_that_a_run_beside_it_found_are_not_shown(
+def test_hands_detected_by_a_concurrent_run_are_not_linked(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both are of one recording, with other settings."""
+    """Both runs have the same recording, but other settings."""
     evaluate = module.evaluate
 
     def linked(artifact_store: store.Store, *inputs: Any) -> Artifact:
@@ -160,10 +162,10 @@ def test_hands_that_a_run_beside_it_found_are_not_shown(
     assert {path.name for path in subject.iterdir() if path.is_symlink()} == set(store.STAGES) - store.OPTIONAL
 
 
-def test_hands_that_are_found_in_place_of_people_stay_linked(
+def test_detected_hands_stay_linked_when_an_earlier_run_detected_people(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An earlier run detected people; this one has the recording's keypoints, finds hands, and is interrupted."""
+    """An earlier run detected people. This one uses the recording's keypoints, detects hands, and is interrupted."""
     artifacts = store.Store(tmp_path / "store")
 
     def hands(artifact_store: store.Store, *_: Any) -> Artifact:
@@ -178,7 +180,7 @@ def test_hands_that_are_found_in_place_of_people_stay_linked(
     assert {path.name for path in linked.iterdir() if path.is_symlink()} == {"capture", "hands"}
 
 
-def test_another_recording_of_the_same_name_is_said(
+def test_another_recording_of_the_same_name_is_logged(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "other").mkdir()

@@ -1,4 +1,4 @@
-"""The base job templates of configs/work_pools/: what Prefect makes of them is what Kubernetes and Docker take."""
+"""The base job templates in configs/work_pools/: Kubernetes and Docker accept the jobs that Prefect makes of them."""
 
 import asyncio
 import json
@@ -16,7 +16,7 @@ from prefect.workers.base import BaseJobConfiguration, BaseWorker
 
 POOLS = Path(__file__).parents[2] / "configs" / "work_pools"
 RUN = FlowRun(id=UUID(int=7), flow_id=UUID(int=8), name="captures/Ada #1")
-NOT_OURS = {"parallelism", "completions"}  # Prefect insists on them in the pod's part, where Kubernetes drops them
+NOT_OURS = {"parallelism", "completions"}  # Prefect requires these in the pod spec, where Kubernetes drops them
 
 
 def template(pool: str) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def template(pool: str) -> dict[str, Any]:
 
 
 def prepared(worker: type[BaseWorker], **values: object) -> BaseJobConfiguration:
-    """Return the job that a worker makes of our template for a run with these job variables."""
+    """Return the job that a worker makes from our template for a run with these job variables."""
     make = worker.job_configuration.from_template_and_values
     job = asyncio.run(make(template(worker.type), values, client=object()))
     job.prepare_for_flow_run(RUN)
@@ -32,7 +32,7 @@ def prepared(worker: type[BaseWorker], **values: object) -> BaseJobConfiguration
 
 
 def manifest(**values: object) -> dict[str, Any]:
-    """Return the manifest of a job, without what Prefect puts where Kubernetes does not know it."""
+    """Return the manifest of a job, without the keys that Prefect puts in the wrong place (NOT_OURS)."""
     module = pytest.importorskip("prefect_kubernetes.worker", reason="prefect-kubernetes is not installed")
     made: dict[str, Any] = prepared(module.KubernetesWorker, **values).job_manifest
     pod = made["spec"]["template"]["spec"]
@@ -41,7 +41,7 @@ def manifest(**values: object) -> dict[str, Any]:
 
 
 def validate(job: dict[str, Any]) -> None:
-    """Raise ValidationError unless the manifest is of the schema, without keys that it does not have."""
+    """Raise ValidationError if the manifest does not match the schema or has unknown keys."""
     schemas = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate is not installed")
     for version in ("1.28", schemas.latest_version()):
         schemas.validate(job, version, strict=True)
@@ -63,7 +63,7 @@ def test_variables_are_declared_and_used(pool: str) -> None:
         ("prefect_kubernetes.worker.KubernetesWorker", {"cpu_request", "memory_request"}),
     ],
 )
-def test_templates_have_the_variables_of_this_prefect(worker: str, replaced: set[str]) -> None:
+def test_templates_have_the_variables_of_the_installed_prefect(worker: str, replaced: set[str]) -> None:
     name, _, kind = worker.rpartition(".")
     module = pytest.importorskip(name, reason=f"{name} is not installed")
     default = getattr(module, kind).get_default_base_job_template()
@@ -72,7 +72,7 @@ def test_templates_have_the_variables_of_this_prefect(worker: str, replaced: set
     assert set(default["variables"]["properties"]) - set(ours["variables"]["properties"]) == replaced
 
 
-def test_a_job_has_one_gpu_and_limits_of_memory_and_time() -> None:
+def test_a_job_has_one_gpu_and_limits_on_memory_and_time() -> None:
     job = manifest()
     validate(job)
     (container,) = job["spec"]["template"]["spec"]["containers"]
@@ -98,13 +98,13 @@ def test_variables_reach_the_job() -> None:
 
 
 def docker_settings(**values: object) -> dict[str, Any]:
-    """Return what the worker asks Docker for."""
+    """Return the container settings that the worker sends to Docker."""
     module = pytest.importorskip("prefect_docker.worker", reason="prefect-docker is not installed")
     job = prepared(module.DockerWorker, env={"PREFECT_API_URL": "https://example.org/api"}, **values)
     return module.DockerWorker._build_container_settings(None, None, job)  # type: ignore[no-any-return]
 
 
-def test_docker_is_asked_for_a_gpu_limits_and_the_folders_of_the_checkout(
+def test_docker_containers_get_a_gpu_limits_and_the_folders_of_the_checkout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -119,6 +119,6 @@ def test_docker_is_asked_for_a_gpu_limits_and_the_folders_of_the_checkout(
     assert (gpu["Count"], gpu["Capabilities"], host["Memory"]) == (1, [["gpu"]], 16 * 2**30)
 
 
-def test_docker_runs_without_a_gpu_if_it_is_told_so() -> None:
+def test_docker_containers_can_run_without_a_gpu() -> None:
     asked = docker_settings(device_requests=[])
     assert asked["device_requests"] == [] and "cpuset_cpus" not in asked
