@@ -1,4 +1,4 @@
-"""Fake stages, which record their calls in the file `calls` beside the store."""
+"""Fake stages, which record their calls in the file `calls` in the store."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def double(out: Path, copied: Artifact) -> dict[str, float]:
 
 @stage("flaky", version="1")
 def flaky(out: Path, source: Source) -> dict[str, float]:
-    """Fail once with the error that the source names."""
+    """Fail on the first call, with the error that the source names."""
     _count(out)
     if len(calls(out.parent.parent)) == 1:
         error = {"io": OSError("disk"), "bad": InputError("a.jpg: bad"), "gone": FileNotFoundError("a.jpg")}
@@ -36,7 +36,7 @@ def flaky(out: Path, source: Source) -> dict[str, float]:
 
 
 def calls(store: Path) -> list[str]:
-    """Return the names of the stages that did work, in order."""
+    """Return the names of the stages that did work in a store, in order."""
     counted = store / "calls"
     return counted.read_text().split() if counted.exists() else []
 

@@ -1,4 +1,4 @@
-"""A rank for the launcher's tests: python -m tests.tasks.ranks MODE FOLDER."""
+"""A rank for the tests of the launcher: python -m tests.tasks.ranks MODE FOLDER."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from hnerf.progress import relay, report
 
 
 def main(mode: str, folder: Path) -> None:
-    """Leave a file named after the process's id, then behave as MODE says."""
+    """Write a file named after the process id, then behave according to `mode`."""
     rank = int(os.environ["RANK"])
     (folder / str(os.getpid())).touch()
     if rank == 1 and mode == "bad":

@@ -1,5 +1,4 @@
-"""A small store of two people for tests, capture -> fit -> training -> evaluation and asset of each, and what was
-before."""
+"""Small stores for tests. A run of a subject leaves capture -> rough fit -> fit -> training -> evaluation and asset."""
 
 import json
 import os
@@ -11,7 +10,7 @@ LONG_AGO_S = 1_600_000_000.0
 
 
 def add(store: Store, stage: str, number: int, *inputs: Artifact, name: str = "") -> Artifact:
-    """Add an artifact whose key is a number, and which is as old as the number says."""
+    """Add an artifact whose key is a number, made that many seconds after LONG_AGO_S."""
 
     def write(out: Path) -> dict[str, float]:
         (out / "deep").mkdir()
@@ -28,7 +27,7 @@ def add(store: Store, stage: str, number: int, *inputs: Artifact, name: str = ""
 
 
 def run_of(store: Store, subject: str, first: int) -> list[Artifact]:
-    """Add what a run leaves, with keys from `first` on: the rough fit, 1 further, has no link."""
+    """Add the artifacts of a run, with keys from `first` on. The rough fit, with key `first` + 1, has no link."""
     capture = store.link_latest(subject, add(store, "capture", first, name=subject))
     rough = add(store, "fit", first + 1, capture)
     fit = store.link_latest(subject, add(store, "fit", first + 2, capture, rough))

@@ -32,9 +32,9 @@ def packed(tmp_path: Path) -> Path:
     return tmp_path / "ada.tar"
 
 
-def test_a_subject_comes_out_and_in_with_all_it_was_computed_from(packed: Path, tmp_path: Path) -> None:
+def test_export_and_import_keep_a_subject_and_all_of_its_inputs(packed: Path, tmp_path: Path) -> None:
     before, store = Store(tmp_path / "from"), Store(tmp_path / "to")
-    for _ in range(2):  # the second time all is there
+    for _ in range(2):  # the second time, everything is already there
         import_subject(store, packed)
         here, there = Inventory.of(store), Inventory.of(before)
         assert here.latest == {"ada": there.latest["ada"]}
@@ -47,8 +47,8 @@ def test_a_subject_comes_out_and_in_with_all_it_was_computed_from(packed: Path, 
     assert not list(store.root.glob("*/*.moving"))
 
 
-def test_a_store_that_an_archive_could_not_hold_is_one_line(tmp_path: Path) -> None:
-    """A damaged note of the recording, and a record of a file that lies elsewhere."""
+def test_the_error_of_a_store_that_cannot_be_archived_is_one_line(tmp_path: Path) -> None:
+    """A damaged note of the recording, and a record that lists a file outside of its artifact."""
     store = Store(tmp_path / "from")
     capture, *_ = run_of(store, "ada", 10)
     (store.subject_folder("ada") / RECORDING).write_bytes(b"\xff\0")
@@ -65,7 +65,7 @@ def test_a_store_that_an_archive_could_not_hold_is_one_line(tmp_path: Path) -> N
         export_subject(store, "ada", tmp_path / "ada.tar")
 
 
-def test_a_run_beside_it_that_has_some_keeps_them(packed: Path, tmp_path: Path) -> None:
+def test_artifacts_that_exist_already_are_kept(packed: Path, tmp_path: Path) -> None:
     store = Store(tmp_path / "to")
     made = run_of(store, "bob", 10)[1]
     import_subject(store, packed)
@@ -73,8 +73,8 @@ def test_a_run_beside_it_that_has_some_keeps_them(packed: Path, tmp_path: Path) 
     assert names([made]) <= Inventory.of(store).stored.keys()
 
 
-def test_hands_that_the_results_did_without_are_not_linked(packed: Path, tmp_path: Path) -> None:
-    """The recording is the same, and so are the links to it."""
+def test_hands_that_the_imported_results_did_not_use_are_not_linked(packed: Path, tmp_path: Path) -> None:
+    """Both runs have the same recording, so the link to it stays."""
     store = Store(tmp_path / "to")
     import_subject(store, packed)
     capture = Inventory.of(store).stored[f"capture/{10:032x}"].artifact
@@ -92,8 +92,8 @@ def test_a_recording_in_a_bucket_keeps_its_url(tmp_path: Path) -> None:
     assert after.recording("ada") == before.recording("ada")
 
 
-def test_what_is_not_linked_yet_is_in_use(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else `gc --older 0` beside it could remove what was just put there."""
+def test_artifacts_are_in_use_during_the_import(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise a concurrent `gc --older 0` could remove artifacts that were just imported."""
 
     def placed(store: Store, name: str, *rest: Any) -> None:
         place(store, name, *rest)
@@ -105,7 +105,7 @@ def test_what_is_not_linked_yet_is_in_use(packed: Path, tmp_path: Path, monkeypa
     assert used == 6 * [True]
 
 
-def test_a_name_of_another_recording_is_refused(packed: Path, tmp_path: Path) -> None:
+def test_a_subject_name_of_another_recording_is_refused(packed: Path, tmp_path: Path) -> None:
     store = Store(tmp_path / "to")
     store.claim("ada", "b" * 64, Path("/recordings/another"))
     with pytest.raises(InputError, match=r"subjects/ada: has the results of another recording"):
@@ -113,7 +113,7 @@ def test_a_name_of_another_recording_is_refused(packed: Path, tmp_path: Path) ->
     assert list(store.root.iterdir()) == [store.root / "subjects"]
 
 
-def test_what_is_damaged_is_not_exported(packed: Path, tmp_path: Path) -> None:
+def test_damaged_artifacts_are_not_exported(packed: Path, tmp_path: Path) -> None:
     store = Store(tmp_path / "from")
     next(store.root.glob("fit/*/deep/letters")).write_text("abd")
     with pytest.raises(InputError, match="damaged; repeat"):
@@ -144,8 +144,8 @@ def change_manifest(path: Path, change: Callable[[dict[str, Any]], object]) -> N
     repack(path, [(manifest_name(text), text), *files])
 
 
-def refused(packed: Path, why: str | None = None) -> None:
-    """Expect that an archive is refused, and nothing of it is stored."""
+def check_refused(packed: Path, why: str | None = None) -> None:
+    """Check that an archive is refused and that nothing of it is stored."""
     store = packed.with_name("to")
     with pytest.raises(InputError, match=why):
         import_subject(Store(store), packed)
@@ -158,13 +158,13 @@ NAME = f"fit/{11:032x}"
 @pytest.mark.parametrize(
     "path", ["../x", "/x", "a/../../x", "", ".", "a//b", "a/./b", "a\0b", "\ud800", "deep/letters/x", "a" * 2000]
 )
-def test_paths_that_lead_out_are_refused(packed: Path, path: str) -> None:
+def test_paths_out_of_the_artifact_are_refused(packed: Path, path: str) -> None:
     def lead_out(manifest: dict[str, Any]) -> None:
         files = manifest["artifacts"][NAME]["files"]
         files[path] = files["deep/letters"]
 
     change_manifest(packed, lead_out)
-    refused(packed, "is not a path inside a folder")
+    check_refused(packed, "is not a path inside a folder")
 
 
 @pytest.mark.parametrize(
@@ -186,9 +186,9 @@ def test_paths_that_lead_out_are_refused(packed: Path, path: str) -> None:
         lambda m: m["artifacts"][NAME]["files"].update(more={"sha256": "0" * 64, "size_bytes": 1}),
     ],
 )
-def test_a_manifest_that_is_none_is_refused(packed: Path, change: Callable[[dict[str, Any]], None]) -> None:
+def test_invalid_manifests_are_refused(packed: Path, change: Callable[[dict[str, Any]], None]) -> None:
     change_manifest(packed, change)
-    refused(packed)
+    check_refused(packed)
 
 
 @pytest.mark.parametrize(
@@ -207,27 +207,31 @@ def test_members_other_than_named_files_are_refused(packed: Path, changes: dict[
     whole = packed.read_bytes()[: -(len(packed.read_bytes()) - 512 * (1 + -(-len(text) // 512)))]
     repack(packed, files, **changes)
     packed.write_bytes(whole + packed.read_bytes())
-    refused(packed, why)
+    check_refused(packed, why)
 
 
-def test_every_cut_and_other_bytes_are_refused(packed: Path) -> None:
+def test_truncated_and_altered_archives_are_refused(packed: Path) -> None:
     whole = packed.read_bytes()
     end = len(whole.rstrip(b"\0"))
     for length in [0, 1, *range(100, end, 331)]:
         packed.write_bytes(whole[:length])
-        refused(packed)
+        check_refused(packed)
     packed.write_bytes(whole[: end - 1] + b"?" + whole[end:])
-    refused(packed, "damaged or cut short")
+    check_refused(packed, "damaged or cut short")
 
 
-def test_what_would_fill_the_disk_is_refused(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_import_that_would_fill_the_disk_is_refused(
+    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "SPARE_BYTES", 1 << 60)
     with pytest.raises(InputError, match="make room"):
         import_subject(Store(tmp_path / "to"), packed)
 
 
-def test_a_file_under_many_paths_counts_as_often(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else an archive of a gigabyte could ask for its digest a hundred thousand times."""
+def test_a_file_under_many_paths_counts_once_per_path(
+    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise an archive of 1 GB could name the digest of its file a hundred thousand times."""
 
     def repeat(manifest: dict[str, Any]) -> None:
         files = manifest["artifacts"][NAME]["files"]
@@ -237,10 +241,12 @@ def test_a_file_under_many_paths_counts_as_often(packed: Path, tmp_path: Path, m
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     import_subject(Store(tmp_path / "once"), packed)
     change_manifest(packed, repeat)
-    refused(packed, "make room")
+    check_refused(packed, "make room")
 
 
-def test_what_a_killed_import_left_is_collected(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leftovers_of_a_killed_import_are_collected(
+    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = Store(tmp_path / "to")
     run_of(store, "bob", 20)
     monkeypatch.setattr("tasks.archive.unpack", lambda *_: os._exit(9))

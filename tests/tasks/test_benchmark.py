@@ -1,4 +1,4 @@
-"""What the scoring stages of a benchmark compare with, on a ball."""
+"""The references of a benchmark's scoring stages, on a ball."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ from tasks.store import Artifact
 from tests.evaluation.ball import BallAvatar, ball_fit, write_ball_capture, write_ball_masks, write_settings
 
 
-def test_masks_of_the_recording_score_test_cameras_without_truth(
+def test_test_cameras_without_true_masks_are_scored_with_the_recordings_masks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
@@ -28,7 +28,7 @@ def test_masks_of_the_recording_score_test_cameras_without_truth(
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: capture)
     monkeypatch.setattr(module, "BodyFit", SimpleNamespace(load=lambda _: ball_fit()))
     monkeypatch.setattr(scoring, "load_avatar", lambda *_: BallAvatar(ball_fit()))
-    monkeypatch.setattr(scoring, "write_result", lambda *_: None)  # which asks for all of training's report
+    monkeypatch.setattr(scoring, "write_result", lambda *_: None)  # it would require a complete training report
     artifact = Artifact(stage="any", root=tmp_path, files={})
     scene = module.scoring_scene(read_capture(capture.root)[1], artifact, artifact, artifact)
     settings = ScoringSettings(meshes=1, snapshot_images=1, snapshot_meshes=0, frame_sizes_px=(16,))

@@ -10,7 +10,7 @@ from hnerf.errors import InputError, PlaceError
 from tasks.bucket import VARIABLE, Bucket, BucketError
 
 
-def test_only_what_is_set_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bucket_is_used_only_if_it_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Bucket.configured() is None
     monkeypatch.setenv(VARIABLE, f"file://{tmp_path}/")
     bucket = Bucket.configured()
@@ -28,13 +28,15 @@ def test_only_what_is_set_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("https://example.com/x", "HNERF_BUCKET: https://example.com/x: is no bucket; download it and give the file"),
     ],
 )
-def test_what_cannot_be_opened_is_refused_in_one_line(url: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_a_bucket_that_cannot_be_opened_is_one_line(
+    url: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(VARIABLE, url)
     with pytest.raises(InputError, match=why):
         Bucket.configured()
 
 
-def test_objects_are_made_read_replaced_and_removed(tmp_path: Path) -> None:
+def test_objects_are_uploaded_downloaded_and_removed(tmp_path: Path) -> None:
     bucket = Bucket.at(f"file://{tmp_path}")
     (tmp_path / "here").write_text("abc")
     bucket.upload(tmp_path / "here", "a/b")
@@ -49,16 +51,14 @@ def test_objects_are_made_read_replaced_and_removed(tmp_path: Path) -> None:
         bucket.download("a/b", tmp_path / "there")
 
 
-def test_a_full_disk_is_not_taken_for_a_bucket_that_is_away(tmp_path: Path) -> None:
-    """That of the machine, onto which an object is written."""
+def test_a_full_disk_is_not_reported_as_an_unreachable_bucket(tmp_path: Path) -> None:
+    """The disk that is full is the local one, to which the object is downloaded."""
     (tmp_path / "object").write_text("abc")
     with pytest.raises(BucketError, match=r"object: .*No space left on device; make room$"):
         Bucket.at(f"file://{tmp_path}").download("object", Path("/dev/full"))
 
 
-def test_an_upload_that_ends_half_way_leaves_the_object_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_upload_leaves_the_object_unchanged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def half(fs: object, path: str, where: str) -> None:
         Path(where).write_text(Path(path).read_text()[:1])
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -74,7 +74,7 @@ def test_an_upload_that_ends_half_way_leaves_the_object_as_it_was(
 
 
 @pytest.mark.parametrize("kind", ["file", "s3"])
-def test_a_note_is_made_once(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+def test_of_concurrent_writers_one_creates_a_note(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     bucket = Bucket.at(f"file://{tmp_path}" if kind == "file" else request.getfixturevalue("s3"))
     with ThreadPoolExecutor(8) as pool:
         assert sum(pool.map(lambda number: bucket.create_note("raced", b"%d" % number), range(8))) == 1
@@ -86,7 +86,7 @@ def test_a_note_is_made_once(kind: str, request: pytest.FixtureRequest, tmp_path
     assert bucket.read_note("a/n") == b"3" * 1000
 
 
-def test_a_bucket_that_is_away_says_so_in_one_line(s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_an_unreachable_bucket_is_one_line(s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(get_filesystem_class("s3"), "retries", 1)
     once = {"retries": {"max_attempts": 0}}
     away = Bucket(filesystem("s3", endpoint_url="http://127.0.0.1:9", config_kwargs=once), "tests/shared")
@@ -94,18 +94,18 @@ def test_a_bucket_that_is_away_says_so_in_one_line(s3: str, monkeypatch: pytest.
         away.size_bytes("x")
 
 
-def test_a_place_where_nothing_was_put_yet_has_no_folders(s3: str) -> None:
+def test_an_empty_place_in_a_bucket_has_no_folders_and_files(s3: str) -> None:
     bucket = Bucket.at(f"{s3}/nothing-yet")
     assert bucket.folders() == [] and list(bucket.files("ada")) == []
 
 
-def test_a_bucket_that_is_not_there_is_not_made(s3: str) -> None:
+def test_a_missing_bucket_is_refused_and_not_created(s3: str) -> None:
     with pytest.raises(PlaceError, match="s3://none/x: none is not there; make it"):
         Bucket.at("s3://none/x")
 
 
-def test_a_share_that_vanishes_may_come_back(tmp_path: Path) -> None:
-    """A heartbeat must survive it, and an upload be tried again."""
+def test_a_vanished_network_share_is_a_bucket_error(tmp_path: Path) -> None:
+    """A heartbeat must survive this, and an upload must be repeated."""
     (tmp_path / "share").mkdir()
     bucket = Bucket.at(f"file://{tmp_path}/share")
     (tmp_path / "share").rmdir()
@@ -114,7 +114,9 @@ def test_a_share_that_vanishes_may_come_back(tmp_path: Path) -> None:
     assert bucket.read_note("n") is None
 
 
-def test_keys_that_expired_are_no_fault_of_the_recording(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_expired_credentials_are_an_error_of_the_place_not_of_the_recording(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     bucket = Bucket.at(f"file://{tmp_path}")
 
     monkeypatch.setattr(type(bucket.fs), "info", Mock(side_effect=PermissionError("The provided token has expired.")))

@@ -25,12 +25,12 @@ WITHOUT_NETWORK = f"import ctypes, sys; sys.exit(bool(ctypes.CDLL(None).unshare(
 
 @pytest.fixture(autouse=True)
 def readers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the reader's process find the functions below."""
+    """Let the reader's process import the functions below."""
     monkeypatch.setenv("PYTHONPATH", str(HERE), prepend=os.pathsep)
 
 
 def read_first(folder: Path) -> Path:
-    """Open a file as readers do, so that it is known as the last one; return it."""
+    """Open a file as readers do, so that errors name it as the last one that was read; return its path."""
     path = folder / "first.bin"
     path.open("rb").close()
     return path
@@ -52,7 +52,7 @@ def never_ends(folder: Path) -> None:
         pass
 
 
-def comes_on(folder: Path) -> None:
+def makes_progress(folder: Path) -> None:
     before_s, _ = resource.getrlimit(resource.RLIMIT_CPU)
     began_s = time.process_time()
     while time.process_time() < began_s + 1.05:  # the limit is in whole seconds
@@ -107,17 +107,17 @@ def is_wrong(folder: Path) -> None:
     raise KeyError("camera")
 
 
-def sent(folder: Path) -> Path:
+def with_first_file(folder: Path) -> Path:
     (folder / "first.bin").touch()
     return folder
 
 
-def test_what_it_logs_reports_prints_and_writes_is_there(
+def test_logs_progress_output_and_files_of_a_reader_arrive(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     heard: list[Progress] = []
     with listening(heard.append):
-        run_caged(reads, sent(tmp_path), tmp_path / "out", folder=tmp_path)
+        run_caged(reads, with_first_file(tmp_path), tmp_path / "out", folder=tmp_path)
     assert [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING and r.name == "hnerf.capture"] == [
         f"{tmp_path / 'first.bin'}: of 2 cameras one is black"
     ]
@@ -136,17 +136,19 @@ def test_what_it_logs_reports_prints_and_writes_is_there(
         (refuses, "no calibration; give one"),
     ],
 )
-def test_what_a_limit_ends_is_refused_with_the_files_name(read: object, why: str, tmp_path: Path) -> None:
+def test_a_reader_that_exceeds_a_limit_is_refused_with_the_name_of_the_file(
+    read: object, why: str, tmp_path: Path
+) -> None:
     set_limits(LimitSettings(stage_s=0.2, image_s=0, reader_gib=1))
     with pytest.raises(InputError, match=f"^{tmp_path}.*{why}$"):
-        run_caged(read, sent(tmp_path), folder=tmp_path)  # type: ignore[arg-type]
+        run_caged(read, with_first_file(tmp_path), folder=tmp_path)  # type: ignore[arg-type]
 
 
-def test_a_reader_that_comes_on_may_take_longer(tmp_path: Path) -> None:
-    run_caged(comes_on, tmp_path, folder=tmp_path)
+def test_a_reader_that_makes_progress_gets_more_time(tmp_path: Path) -> None:
+    run_caged(makes_progress, tmp_path, folder=tmp_path)
 
 
-def test_errors_of_the_machine_can_be_retried_and_faults_of_ours_show_where(tmp_path: Path) -> None:
+def test_errors_of_the_machine_are_retryable_and_bugs_have_a_traceback(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space left on device") as raised:
         run_caged(finds_no_space, tmp_path, folder=tmp_path)
     assert (raised.value.errno, raised.value.filename) == (28, "/out")
@@ -160,12 +162,12 @@ def test_errors_of_the_machine_can_be_retried_and_faults_of_ours_show_where(tmp_
     subprocess.run([sys.executable, "-c", WITHOUT_NETWORK], check=False).returncode != 0,
     reason="the system lets no process give up its network",
 )
-def test_there_is_no_network(tmp_path: Path) -> None:
+def test_a_reader_has_no_network(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server, pytest.raises(OSError, match="Network is unreachable"):
         run_caged(calls_home, tmp_path, server.getsockname()[1], folder=tmp_path)
 
 
-def test_a_reader_that_stands_still_ends_with_its_stage(tmp_path: Path) -> None:
+def test_a_stalled_reader_ends_with_its_stage(tmp_path: Path) -> None:
     set_limits(LimitSettings(stage_s=6, image_s=0))
     with pytest.raises(StalledError), limited("capture", 1, resumable=False):
         run_caged(waits, tmp_path, folder=tmp_path)

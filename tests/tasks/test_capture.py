@@ -1,4 +1,4 @@
-"""The artifact of a recording."""
+"""The stage that ingests a recording."""
 
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ from tasks.store import Store
 from tests.capture.recordings import write_easymocap
 
 
-def test_a_recording_that_changes_while_it_is_read_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else it would be found under the digest of what was there before."""
+def test_a_recording_that_changes_while_it_is_read_is_not_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise it would be found under the digest of the earlier content."""
 
     def changing(*arguments: Any, folder: Path) -> None:
         (folder / "new.txt").touch()

@@ -1,4 +1,4 @@
-"""Conditions under which networks detect people and their hands."""
+"""When networks are used to detect people and their hands."""
 
 import dataclasses
 from pathlib import Path
@@ -20,7 +20,7 @@ from tests.segmentation.scene import write_likely, write_scene
     ("source", "detected", "silent"),
     [(None, False, True), ("recording", False, False), ("network", True, True), ("both", True, True)],
 )
-def test_a_recording_with_detections_and_one_without(
+def test_detection_depends_on_the_setting_and_the_recordings_keypoints(
     tmp_path: Path, source: str | None, detected: bool, silent: bool
 ) -> None:
     ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
@@ -31,7 +31,7 @@ def test_a_recording_with_detections_and_one_without(
     assert needs_detection(recording, settings) is silent
 
 
-def test_a_network_that_detected_people_stands_for_a_rough_fit(tmp_path: Path) -> None:
+def test_detected_people_make_a_rough_fit_unnecessary(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path, 1, plate=False)
     capture.save()
     recording = Artifact(stage="capture", root=capture.root, files={})
@@ -40,7 +40,9 @@ def test_a_network_that_detected_people_stands_for_a_rough_fit(tmp_path: Path) -
     assert not needs_body(recording, SegmentationSettings())
 
 
-def test_a_single_camera_wants_the_depth_of_limbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_single_camera_needs_detection_for_the_depth_of_limbs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path))
     capture = Capture.load(ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture").root)
     dataclasses.replace(capture, train_cameras=capture.train_cameras[:1]).save()
@@ -53,7 +55,9 @@ def test_a_single_camera_wants_the_depth_of_limbs(tmp_path: Path, monkeypatch: p
     assert not needs_detection(recording, DetectionSettings())
 
 
-def test_hands_need_a_network_keypoints_and_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hand_detection_needs_a_network_keypoints_two_cameras_and_the_setting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "models"))
     ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
     recording = Artifact(stage="capture", root=tmp_path / "capture", files={})

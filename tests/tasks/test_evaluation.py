@@ -1,4 +1,4 @@
-"""The evaluation stage and the ground truth that its key stands for; what it evaluates is fake."""
+"""The evaluation stage and the ground truth that is part of its key; the evaluation itself is fake."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +13,10 @@ from tasks.source import read_capture
 from tasks.store import Artifact, Store
 
 
-def test_scores_are_kept_only_with_the_ground_truth_of_their_key(
+def test_scores_are_stored_only_if_the_ground_truth_is_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Edit the ground truth while the images are rendered."""
+    """The ground truth changes while the images are rendered."""
     mesh = tmp_path / "ada" / "ground_truth" / "mesh.ply"
     mesh.parent.mkdir(parents=True)
     mesh.write_text("true")

@@ -1,4 +1,4 @@
-"""The artifact of a fitted body, with a fake fit."""
+"""The fit stage, with a fake fit."""
 
 from pathlib import Path
 
@@ -11,15 +11,13 @@ from tasks.store import Artifact, Store
 
 
 class Body:
-    """A fake body of one file."""
+    """A fake body that is saved as one file."""
 
     def save(self, out: Path) -> None:
         (out / "body.npz").write_bytes(b"body")
 
 
-def test_the_same_body_made_again_is_the_same_artifact_however_long_it_took(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_digest_of_a_fit_does_not_depend_on_its_duration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: None)
     given = Artifact(stage="capture", root=tmp_path, files={})
 

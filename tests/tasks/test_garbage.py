@@ -55,28 +55,28 @@ def test_more_results_of_each_subject_can_be_kept(store: Store) -> None:
     assert garbage(store, keep=2) == names(first) and garbage(store, keep=1) == names(first + second)
 
 
-def test_a_run_that_ended_early_does_not_cost_the_finished_one(store: Store) -> None:
+def test_an_unfinished_run_does_not_replace_the_finished_one(store: Store) -> None:
     first, second = run_of(store, "ada", 10), run_of(store, "ada", 20)
     store.link_latest("ada", add(store, "fit", 30, second[0]))
     assert Inventory.of(store).latest["ada"].keys() == {"capture", "fit"}
     assert garbage(store) == names(first)
 
 
-def test_rows_of_an_ablation_are_no_results(store: Store) -> None:
-    """They end with an evaluation, and nobody links to them."""
+def test_rows_of_an_ablation_do_not_count_as_results(store: Store) -> None:
+    """They end with an evaluation, but no subject links to them."""
     first, second = run_of(store, "ada", 10), run_of(store, "ada", 20)
     rows = [add(store, "training", 30 + n, second[2]) for n in range(3)]
     rows += [add(store, "evaluation", 40 + n, row) for n, row in enumerate(rows)]
     assert garbage(store, keep=2) == names(rows) and garbage(store, keep=1) == names(first + rows)
 
 
-def test_what_was_used_lately_stays(store: Store) -> None:
+def test_recently_used_artifacts_stay(store: Store) -> None:
     before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
     store.find("fit", before[1].root.name)
     assert garbage(store, older_s=3600) == names(before) - {before[1].name}
 
 
-def test_a_use_between_look_and_removal_saves_it(store: Store) -> None:
+def test_an_artifact_used_between_search_and_removal_stays(store: Store) -> None:
     before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
     found = find_garbage(Inventory.of(store), 1, 0)
     used = store.find("fit", before[2].root.name)
@@ -91,7 +91,7 @@ def use(root: Path, used: Event, done: Event) -> None:
     done.wait(PATIENCE_S)
 
 
-def test_what_a_running_process_uses_stays_until_it_is_killed(store: Store) -> None:
+def test_artifacts_in_use_stay_until_their_process_is_killed(store: Store) -> None:
     before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
     used, done = SPAWN.Event(), SPAWN.Event()
     process = SPAWN.Process(target=use, args=(store.root, used, done))
@@ -106,8 +106,8 @@ def test_what_a_running_process_uses_stays_until_it_is_killed(store: Store) -> N
     assert list((store.root / pins.FOLDER).iterdir()) == []
 
 
-def test_a_store_that_may_only_be_read_is_looked_at(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Root may write anywhere, so that removal is made to fail here."""
+def test_garbage_can_be_listed_in_a_read_only_store(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests may run as root, who may write anywhere, so removal is made to fail."""
     before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
     (store.root / pins.FOLDER).mkdir(exist_ok=True)
     (store.root / pins.FOLDER / "0dead").write_text(f"{before[0].name}\n")
@@ -116,7 +116,7 @@ def test_a_store_that_may_only_be_read_is_looked_at(store: Store, monkeypatch: p
     assert garbage(store) == names(before)
 
 
-def test_unfinished_work_goes_unless_somebody_is_at_it(store: Store) -> None:
+def test_unfinished_work_is_removed_unless_it_is_locked(store: Store) -> None:
     run_of(store, "ada", 10)
     fit = store.root / "fit"
     for number, end in ((90, ".partial"), (91, ".partial"), (92, "")):
@@ -140,8 +140,9 @@ def test_unfinished_work_goes_unless_somebody_is_at_it(store: Store) -> None:
     assert (store.root / "subjects" / "ada").is_dir()
 
 
-def test_what_cannot_be_found_goes_unless_a_subject_links_to_it(store: Store) -> None:
-    """A damaged record, and one whose folder was deleted: both would stay for ever, the former with its files."""
+def test_unreadable_artifacts_are_removed_unless_a_subject_links_to_them(store: Store) -> None:
+    """A damaged record, and a record whose folder was deleted. Otherwise both would stay forever, the first with its
+    files."""
     before, now = run_of(store, "ada", 10), run_of(store, "ada", 20)
     for training in (before[3], now[3]):
         record = store.path("training", training.root.name, ".json")
@@ -155,8 +156,8 @@ def test_what_cannot_be_found_goes_unless_a_subject_links_to_it(store: Store) ->
 
 
 @pytest.mark.parametrize("lose", [lambda record: record.write_text("{"), Path.unlink])
-def test_what_is_recorded_meanwhile_stays(store: Store, lose: Callable[[Path], object]) -> None:
-    """A damaged record is made anew, or a folder gets its name and then its record."""
+def test_an_artifact_that_was_recorded_meanwhile_stays(store: Store, lose: Callable[[Path], object]) -> None:
+    """Either a damaged record is written again, or a folder gets its name first and its record later."""
     made = add(store, "fit", 90)
     record = store.path("fit", f"{90:032x}", ".json")
     text = record.read_text()
@@ -167,7 +168,7 @@ def test_what_is_recorded_meanwhile_stays(store: Store, lose: Callable[[Path], o
     assert not collect(store, one) and store.find("fit", f"{90:032x}") == made
 
 
-def test_people_whose_names_look_like_keys_are_no_garbage(store: Store) -> None:
+def test_subjects_with_names_like_keys_are_not_garbage(store: Store) -> None:
     run_of(store, "a" * 32, 10)
     assert garbage(store) == set()
 
@@ -181,8 +182,8 @@ def test_work_that_was_resumed_meanwhile_stays(store: Store) -> None:
     assert not collect(store, one) and partial.exists()
 
 
-def test_a_lock_that_was_removed_under_a_waiting_process_holds_nobody_apart(store: Store) -> None:
-    """Whoever waited takes the lock that lies there now, so that a third cannot hold another one."""
+def test_a_process_that_waited_for_a_removed_lock_takes_the_new_one(store: Store) -> None:
+    """The waiting process locks the file that exists now, so that a third process cannot hold another lock."""
     path = store.path("fit", f"{1:032x}", ".lock")
     held = threading.Event()
 
@@ -202,7 +203,7 @@ def test_a_lock_that_was_removed_under_a_waiting_process_holds_nobody_apart(stor
         waiting.result(PATIENCE_S)
 
 
-def test_records_without_inputs_keep_what_is_linked(store: Store) -> None:
+def test_linked_artifacts_with_records_without_inputs_stay(store: Store) -> None:
     made = add(store, "fit", 1)
     record = store.path("fit", made.root.name, ".json")
     record.write_text(record.read_text().replace('"inputs":[]', '"earlier":1').replace('"inputs": []', '"earlier":1'))

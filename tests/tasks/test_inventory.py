@@ -17,27 +17,27 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
     return Store(tmp_path)
 
 
-def test_an_artifact_is_known_by_size_and_times(store: Store) -> None:
+def test_the_inventory_has_sizes_and_times(store: Store) -> None:
     made = add(store, "fit", 7)
     stored = Inventory.of(store).stored[made.name]
     assert (stored.size_bytes, stored.made_s, stored.used_s) == (5, LONG_AGO_S + 7, LONG_AGO_S + 7)  # "abc 7"
 
 
-def test_inputs_of_inputs_are_found_once(store: Store) -> None:
+def test_inputs_of_inputs_are_included_once(store: Store) -> None:
     capture, rough, fit, training, evaluation, _ = run_of(store, "ada", 10)
     found = Inventory.of(store)
     assert found.with_inputs([evaluation.name]) == names([capture, rough, fit, training, evaluation])
     assert found.with_inputs([rough.name, "fit/gone"]) == names([capture, rough])
 
 
-def test_an_artifact_that_no_link_leads_to_is_its_recording_s(store: Store) -> None:
-    """A degraded fit of ada's, say; bob's results are his own."""
+def test_an_artifact_without_a_link_belongs_to_the_subject_of_its_recording(store: Store) -> None:
+    """For example a degraded fit of ada; bob's results are not affected."""
     capture, *_ = run_of(store, "ada", 10)
     run_of(store, "bob", 20)
     degraded = add(store, "study-fit", 30, capture)
     found = Inventory.of(store)
     assert found.owners[degraded.name] == {"ada"}
-    assert [one.artifact.name for one in found.of_subject("ada")][-1] == degraded.name  # the last that was made
+    assert [one.artifact.name for one in found.of_subject("ada")][-1] == degraded.name  # the newest one is last
     assert degraded.name not in found.needed()
 
 
@@ -51,7 +51,7 @@ def test_an_artifact_that_no_link_leads_to_is_its_recording_s(store: Store) -> N
         {"metrics": {"psnr": float("nan")}},
     ],
 )
-def test_a_record_that_is_damaged_or_cannot_be_is_named(store: Store, change: dict[str, object] | None) -> None:
+def test_damaged_and_invalid_records_are_listed_as_unreadable(store: Store, change: dict[str, object] | None) -> None:
     record = store.path("fit", add(store, "fit", 7).root.name, ".json")
     record.write_text(json.dumps(json.loads(record.read_text()) | change) if change else "[")
     found = Inventory.of(store)
@@ -68,8 +68,10 @@ def test_a_link_in_place_of_an_artifact_is_unreadable(store: Store, suffix: str,
 
 
 @pytest.mark.parametrize("replace", [os.mkfifo, lambda path: path.symlink_to("named.json")])
-def test_a_recording_s_name_is_read_from_a_file_alone(store: Store, replace: Callable[[Path], None]) -> None:
-    """A pipe would be waited for without end, and a link may lead to a device."""
+def test_the_name_of_a_recording_is_read_only_from_a_regular_file(
+    store: Store, replace: Callable[[Path], None]
+) -> None:
+    """Reading a pipe would wait forever, and a link may lead to a device."""
     capture = add(store, "capture", 7, name="ada")
     assert Inventory.of(store).owners[capture.name] == {"ada"}
     (capture.root / "capture.json").rename(capture.root / "named.json")
@@ -77,7 +79,7 @@ def test_a_recording_s_name_is_read_from_a_file_alone(store: Store, replace: Cal
     assert Inventory.of(store).owners[capture.name] == set()
 
 
-def test_the_recording_of_a_subject_is_where_it_was_read(store: Store) -> None:
+def test_the_recording_of_a_subject_is_the_path_it_was_read_from(store: Store) -> None:
     assert recording_of(store, "ada") == ""
     store.claim("ada", "0123", Path("/recordings/ada"))
     assert recording_of(store, "ada") == "/recordings/ada"

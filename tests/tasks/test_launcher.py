@@ -24,20 +24,20 @@ PATIENCE_S = 60.0
 
 
 @pytest.fixture(autouse=True)
-def ranks_find_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put the tests, which are not installed, on the ranks' path."""
+def tests_on_python_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put the tests, which are not installed, on the Python path of the ranks."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
 
 
 def still_running(folder: Path) -> list[int]:
-    """Return the process ids of the ranks that have begun and not ended."""
+    """Return the process ids of the ranks that are running."""
     return [i for i in (int(path.name) for path in folder.iterdir()) if runs(i)]
 
 
 def runs(process: int) -> bool:
     try:
         return b") Z" not in Path(f"/proc/{process}/stat").read_bytes()
-    except (FileNotFoundError, ProcessLookupError):  # the latter where it ends between open and read
+    except (FileNotFoundError, ProcessLookupError):  # the latter if it ends between open and read
         return False
 
 
@@ -48,10 +48,10 @@ def wait_until_running(folder: Path, count: int) -> None:
         time.sleep(0.05)
 
 
-def test_ranks_log_lines_as_they_come_report_progress_and_import_nothing_from_where_the_user_stands(
+def test_ranks_log_at_once_report_progress_and_ignore_modules_in_the_working_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Progress is not logged, too."""
+    """Progress lines are reported, but not logged as well."""
     for name in ("tasks.py", "torch.py"):
         (tmp_path / name).write_text("raise SystemExit(1)")
     monkeypatch.chdir(tmp_path)
@@ -62,13 +62,13 @@ def test_ranks_log_lines_as_they_come_report_progress_and_import_nothing_from_wh
     for rank in (0, 1):
         mine = [record for record in lines if record.message.startswith(f"rank {rank} of 2 at ")]
         delays_s = [record.created - float(record.message.split()[-1]) for record in mine]
-        assert len(delays_s) == 3 and max(delays_s) - min(delays_s) < 0.4  # they are written 0.5 s apart
+        assert len(delays_s) == 3 and max(delays_s) - min(delays_s) < 0.4  # the ranks write 0.5 s apart
     assert len(lines) == 6
     progress = [record.progress for record in caplog.records if record.name == "hnerf.progress"]
     assert sorted(progress) == [("training", 0, 8), ("training", 1, 8)]
 
 
-def test_threads_of_ranks_sleep_while_they_wait_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_threads_of_ranks_sleep_unless_the_user_set_a_policy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     assert launcher._environment(2)["OMP_WAIT_POLICY"] == "PASSIVE"
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
@@ -82,7 +82,7 @@ def test_threads_of_ranks_sleep_while_they_wait_unless_the_user_says_otherwise(m
         ("killed", LostWorkerError, "rank 1 was killed by SIGKILL"),
     ],
 )
-def test_one_failing_rank_ends_all_with_its_message(
+def test_a_failing_rank_ends_all_ranks_with_its_message(
     tmp_path: Path, mode: str, error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error) as caught:
@@ -107,7 +107,7 @@ def test_one_failing_rank_ends_all_with_its_message(
         (-signal.SIGSEGV, "oh", RuntimeError, "^ranks: rank 1 crashed with SIGSEGV\na warning\noh$"),
     ],
 )
-def test_the_first_failure_of_torchrun_by_exit_code(
+def test_the_exit_code_of_the_first_failure_determines_the_error(
     tmp_path: Path, code: int, line: str, error: type[Exception], message: str
 ) -> None:
     (tmp_path / launcher.FAILURE).write_text(json.dumps([1, code]))
@@ -118,7 +118,7 @@ def test_the_first_failure_of_torchrun_by_exit_code(
     assert type(found) is error and re.search(message, str(found))
 
 
-def test_a_report_that_had_no_room_is_a_full_disk(tmp_path: Path) -> None:
+def test_an_empty_failure_report_is_a_full_disk(tmp_path: Path) -> None:
     (tmp_path / launcher.FAILURE).touch()
     found = launcher._error("ranks", tmp_path, 1)
     assert is_retryable(found) and str(found) == f"[Errno 28] No space left on device: '{tmp_path}/{launcher.FAILURE}'"
@@ -127,7 +127,7 @@ def test_a_report_that_had_no_room_is_a_full_disk(tmp_path: Path) -> None:
 @pytest.mark.parametrize("fatal", [signal.SIGKILL, signal.SIGINT])
 def test_ranks_end_with_the_caller(tmp_path: Path, fatal: signal.Signals) -> None:
     code = f"from tasks.launcher import run_ranks; run_ranks({RANKS!r}, ['sleep', {str(tmp_path)!r}], 2)"
-    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background job would ignore it
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a background job of a shell would ignore SIGINT
     caller = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, preexec_fn=heard)
     wait_until_running(tmp_path, 2)
     os.kill(caller.pid, fatal)
@@ -135,7 +135,7 @@ def test_ranks_end_with_the_caller(tmp_path: Path, fatal: signal.Signals) -> Non
     wait_until_running(tmp_path, 0)
 
 
-def test_torchrun_ends_whatever_thread_of_it_goes_on(
+def test_torchrun_ends_even_if_one_of_its_threads_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(arguments: object) -> None:
@@ -152,7 +152,7 @@ def test_torchrun_ends_whatever_thread_of_it_goes_on(
     assert os.waitstatus_to_exitcode(status) == 1 and "while it ended its ranks" in capfd.readouterr().err
 
 
-def test_ranks_end_with_torchrun_which_is_worth_another_try(tmp_path: Path) -> None:
+def test_ranks_end_with_torchrun_and_its_loss_is_a_lost_worker(tmp_path: Path) -> None:
     with ThreadPoolExecutor() as pool:
         launched = pool.submit(run_ranks, RANKS, ["sleep", str(tmp_path)], 2)
         wait_until_running(tmp_path, 2)
@@ -164,7 +164,7 @@ def test_ranks_end_with_torchrun_which_is_worth_another_try(tmp_path: Path) -> N
 
 
 def test_folders_of_killed_launchers_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One is locked, one was made just now, one is nobody's."""
+    """Of three folders, one is locked, one is new, and one was left behind."""
     monkeypatch.setattr(launcher, "gettempdir", lambda: str(tmp_path))
     for name in ("used", "young", "left"):
         (tmp_path / f"hnerf-ranks-{name}").mkdir()

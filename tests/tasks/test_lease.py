@@ -26,8 +26,8 @@ def notes(bucket: Bucket) -> list[str]:
     return sorted(Path(path).name for path in bucket.fs.glob(f"{bucket.root}/fit/*"))
 
 
-def test_one_who_lives_is_waited_for(bucket: Bucket) -> None:
-    """The owner works for longer than a lease that nobody renews lasts."""
+def test_others_wait_for_an_owner_that_is_alive(bucket: Bucket) -> None:
+    """The owner works for longer than a lease lasts if it is not renewed."""
     inside, order = Event(), list[str]()
 
     def own() -> None:
@@ -47,7 +47,7 @@ def test_one_who_lives_is_waited_for(bucket: Bucket) -> None:
     assert notes(bucket) == []
 
 
-def test_the_owner_keeps_showing_that_it_lives(bucket: Bucket) -> None:
+def test_the_owner_renews_its_lease(bucket: Bucket) -> None:
     seen = set()
     with leased(bucket, NAME):
         for _ in range(30):
@@ -56,14 +56,14 @@ def test_the_owner_keeps_showing_that_it_lives(bucket: Bucket) -> None:
     assert len(seen - {b"", None}) > 2  # a file is empty while it is written
 
 
-def test_who_waits_sees_that_another_took_over(bucket: Bucket) -> None:
-    """The first owner is silent, but it is the second one's turn that counts now."""
+def test_a_waiting_process_notices_that_another_took_over(bucket: Bucket) -> None:
+    """The first owner is silent, but a second one has taken over: now only its turn counts."""
     for turn in (0, 1):
         bucket.create_note(f"{NAME}.lease.{turn}", b"gone:1 5")
     assert not lease._expires(bucket, NAME, 0, b"gone:1 5")
 
 
-def test_of_many_one_takes_over_from_one_who_died(bucket: Bucket) -> None:
+def test_exactly_one_process_takes_over_from_a_dead_owner(bucket: Bucket) -> None:
     bucket.create_note(f"{NAME}.lease.0", b"gone:1 5")
     together, held = Barrier(8), list[float]()
 
@@ -82,8 +82,8 @@ def test_of_many_one_takes_over_from_one_who_died(bucket: Bucket) -> None:
     assert notes(bucket) == []
 
 
-def test_a_process_that_is_gone_is_not_waited_for_where_it_ran(bucket: Bucket) -> None:
-    """Its number says nothing of another machine, another start of this one, or another container."""
+def test_a_dead_owner_is_replaced_at_once_on_its_own_machine(bucket: Bucket) -> None:
+    """Its process id means nothing on another machine, after a reboot, or in another container."""
     gone = subprocess.Popen(["true"])
     gone.wait()
     host, place, _ = lease._text(0).decode().split()
@@ -95,7 +95,7 @@ def test_a_process_that_is_gone_is_not_waited_for_where_it_ran(bucket: Bucket) -
             assert mine and least_s <= time.monotonic() - began_s < most_s
 
 
-def test_given_up_work_can_be_taken_at_once(bucket: Bucket) -> None:
+def test_released_work_can_be_taken_at_once(bucket: Bucket) -> None:
     with pytest.raises(KeyboardInterrupt), leased(bucket, NAME):
         raise KeyboardInterrupt
     assert bucket.read_note(f"{NAME}.lease.0") == FREE
@@ -105,8 +105,8 @@ def test_given_up_work_can_be_taken_at_once(bucket: Bucket) -> None:
     assert notes(bucket) == []
 
 
-def test_turns_that_are_only_partly_removed_have_no_gap(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Behind a gap, nobody would see the next owner, and two would work at once."""
+def test_partly_removed_turns_have_no_gap(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a gap in the turns, nobody would see the next owner, and two would work at once."""
 
     def remove_one(self: Bucket, name: str) -> None:
         monkeypatch.setattr(Bucket, "remove", Mock(side_effect=BucketError("away")))

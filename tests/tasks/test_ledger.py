@@ -7,7 +7,7 @@ from tasks.ledger import Ledger, forget, was_started
 DIGEST, OTHER = "a" * 64, "b" * 64
 
 
-def test_a_capture_that_was_lost_is_free_again_under_another_key(tmp_path: Path) -> None:
+def test_a_forgotten_capture_can_be_started_again_under_another_key(tmp_path: Path) -> None:
     ledger = Ledger.of(tmp_path)
     for digest, name in ((DIGEST, "ada"), (OTHER, "bob")):
         ledger.note_started(digest, tmp_path / name, f"run of {name}")
@@ -27,8 +27,8 @@ def test_a_store_without_a_ledger_has_nothing_to_forget(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_listing_stands_since_it_was_asked_about_first(tmp_path: Path) -> None:
-    """A hundred seconds ago; asking again does not begin anew, but what was started does."""
+def test_the_age_of_a_listing_counts_from_its_first_query(tmp_path: Path) -> None:
+    """First seen 100 s ago. Asking again does not restart the count; starting the capture does."""
     ledger, began_s = Ledger.of(tmp_path), time.time() - 100
     assert ledger.stood_s("seen-ada") < 50
     os.utime(tmp_path / "ingested" / "new-seen-ada", (began_s, began_s))
@@ -37,7 +37,7 @@ def test_a_listing_stands_since_it_was_asked_about_first(tmp_path: Path) -> None
     assert ledger.stood_s("seen-ada") < 50
 
 
-def test_an_empty_note_is_of_no_capture(tmp_path: Path) -> None:
+def test_an_empty_note_is_ignored(tmp_path: Path) -> None:
     ledger = Ledger.of(tmp_path)
     ledger.note_seen("seen-ada", "")
     assert not ledger.seen("seen-ada")
@@ -52,7 +52,7 @@ def test_a_capture_that_was_started_again_is_not_lost(tmp_path: Path) -> None:
     assert ledger.start_key(DIGEST) == first
 
 
-def test_damaged_notes_are_of_no_capture(tmp_path: Path) -> None:
+def test_damaged_notes_are_ignored(tmp_path: Path) -> None:
     ledger = Ledger.of(tmp_path)
     for name in (DIGEST, "seen-ada"):
         (ledger.root / name).write_bytes(b"\xff\xfe")

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def within(stage_s: float, work: Callable[[], Any], image_s: float = 0.0) -> Any:
-    """Do something with a limit that later tests do not have."""
+    """Run work under limits that do not affect later tests; return its result."""
 
     def both() -> Any:
         set_limits(LimitSettings(stage_s=stage_s, image_s=image_s))
@@ -48,19 +48,19 @@ def sleep_in(resumable: bool, with_progress_every_s: float | None = None, durati
 
 
 @pytest.mark.parametrize("resumable", [True, False])
-def test_a_stage_without_progress_is_ended_and_its_cause_said(resumable: bool) -> None:
+def test_a_stage_without_progress_is_ended_with_its_cause(resumable: bool) -> None:
     with pytest.raises(StalledError, match=r"^fit: ended, no progress for 0 s \(in a library\); if the") as caught:
         within(0.1, lambda: sleep_in(resumable))
     assert is_retryable(caught.value) == resumable
     assert signal.getsignal(signal.SIGALRM) == signal.SIG_DFL and signal.getitimer(signal.ITIMER_REAL) == (0, 0)
 
 
-def test_progress_gives_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_restarts_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "REARM_S", 0.0)
     within(0.3, lambda: sleep_in(False, with_progress_every_s=0.1, duration_s=0.6))
 
 
-def test_progress_in_another_thread_gives_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_in_another_thread_restarts_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """A download from a bucket reports from the thread of its event loop."""
     monkeypatch.setattr(limits, "REARM_S", 0.0)
 
@@ -76,7 +76,7 @@ def test_progress_in_another_thread_gives_time(monkeypatch: pytest.MonkeyPatch) 
     within(0.5, wait_for_download)
 
 
-def test_the_same_progress_again_gives_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_progress_does_not_restart_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "REARM_S", 0.0)
 
     def report_the_same() -> None:
@@ -90,7 +90,7 @@ def test_the_same_progress_again_gives_no_time(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_limits_grow_with_the_recording(tmp_path: Path) -> None:
-    """Two cameras and three frames, two of them to train on: 10 s + 6 x 0.5 s."""
+    """Two cameras with three frames, two of them for training: 10 s + 6 x 0.5 s."""
     assert within(10.0, lambda: limit_s(6), image_s=0.5) == 13.0
     recording = add(Store(tmp_path), "capture", 1)
     text = '{"cameras": {"a": 1, "b": 2}, "train_frames": [0, 4], "novel_pose_frames": [8]}'
@@ -112,20 +112,20 @@ def test_a_stage_that_is_ended_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 @flow
-def one_stuck(store: Path, source: Source) -> None:
-    """Run a stage that stands still, with the limits that the flow sets."""
+def flow_with_stuck_stage(store: Path, source: Source) -> None:
+    """Run a stage that makes no progress, under limits that the flow sets."""
     set_limits(LimitSettings(stage_s=0.1, image_s=0))
     Stage(stuck, "stuck", "1", resumable=False)(Store(store), source)
 
 
-def test_limits_hold_in_a_flow_run_and_a_standstill_is_not_tried_again(prefect_api: str, tmp_path: Path) -> None:
+def test_limits_apply_in_a_flow_run_and_a_stall_is_not_retried(prefect_api: str, tmp_path: Path) -> None:
     (tmp_path / "ada").mkdir()
     with pytest.raises(StalledError, match=r"^stuck: ended"):
-        one_stuck(tmp_path / "store", read_capture(tmp_path / "ada")[0])
+        flow_with_stuck_stage(tmp_path / "store", read_capture(tmp_path / "ada")[0])
 
 
-def test_waiting_for_another_process_is_no_standstill(tmp_path: Path) -> None:
-    """It has a limit of its own."""
+def test_waiting_for_another_process_is_not_a_stall(tmp_path: Path) -> None:
+    """The other process has a limit of its own."""
     store, found = Store(tmp_path / "store"), []
     write = 'lambda out: (print("at it", flush=True), __import__("time").sleep(1)) and {}'
     code = f"from pathlib import Path; from tasks.store import Store; Store(Path({str(store.root)!r}))"
@@ -137,7 +137,7 @@ def test_waiting_for_another_process_is_no_standstill(tmp_path: Path) -> None:
     other.stdout.close()
 
 
-def test_ranks_that_stand_still_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stalled_ranks_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
     def wait_for_ranks() -> None:
@@ -149,8 +149,8 @@ def test_ranks_that_stand_still_are_ended(tmp_path: Path, monkeypatch: pytest.Mo
     wait_until_running(tmp_path, 0)
 
 
-def test_code_that_never_comes_back_ends_its_process() -> None:
-    """It sees no signals."""
+def test_code_that_never_returns_ends_its_process() -> None:
+    """Such code handles no signals."""
     code = """
 import signal, time
 from hnerf.config import LimitSettings

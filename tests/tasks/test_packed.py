@@ -24,7 +24,7 @@ def test_a_manifest_is_named_by_its_digest() -> None:
     assert manifest_name(b"abc") == f"{ABC}.json"
 
 
-def test_an_artifact_comes_out_as_it_went_in(packed: Path, tmp_path: Path) -> None:
+def test_an_artifact_is_the_same_after_packing_and_unpacking(packed: Path, tmp_path: Path) -> None:
     before, store = Store(tmp_path / "from"), Store(tmp_path / "to")
     (tmp_path / "scratch").mkdir()
     (tmp_path / "to" / "fit").mkdir(parents=True)
@@ -45,7 +45,7 @@ def test_a_manifest_with_another_digest_is_refused(packed: Path) -> None:
 
 
 @pytest.mark.parametrize(("length", "fits"), [(255, True), (256, False)])
-def test_names_are_no_longer_than_file_systems_take_them(length: int, fits: bool) -> None:
+def test_names_too_long_for_file_systems_are_refused(length: int, fits: bool) -> None:
     stored = {"sha256": ABC, "size_bytes": 3}
     with nullcontext() if fits else pytest.raises(ValueError, match="is not a path inside a folder: too long"):
         ArchivedArtifact.model_validate({"files": {f"deep/{'a' * length}": stored}})

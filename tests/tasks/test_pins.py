@@ -11,7 +11,7 @@ from tasks import pins
 from tasks.pins import FOLDER, pin, pinned, unless_read_only
 
 
-def test_what_this_process_uses_is_pinned(tmp_path: Path) -> None:
+def test_artifacts_used_by_this_process_are_pinned(tmp_path: Path) -> None:
     assert pinned(tmp_path) == set()
     pin(tmp_path, "fit/1")
     pin(tmp_path, "capture/2")
@@ -19,8 +19,8 @@ def test_what_this_process_uses_is_pinned(tmp_path: Path) -> None:
     assert len(list((tmp_path / FOLDER).iterdir())) == 1
 
 
-def test_what_a_dead_process_used_is_forgotten(tmp_path: Path) -> None:
-    """The kernel has released its lock."""
+def test_pins_of_a_dead_process_are_removed(tmp_path: Path) -> None:
+    """The kernel has released the lock of the dead process."""
     left = tmp_path / FOLDER / "0123"
     left.parent.mkdir()
     left.write_text("fit/1\n")
@@ -30,35 +30,35 @@ def test_what_a_dead_process_used_is_forgotten(tmp_path: Path) -> None:
     assert pinned(tmp_path) == set() and not left.exists()
 
 
-def test_a_store_that_may_only_be_read_notes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_a_read_only_store_nothing_is_pinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pins, "_begin", Mock(side_effect=OSError(errno.EROFS, os.strerror(errno.EROFS))))
     pin(tmp_path, "fit/1")
     assert pinned(tmp_path) == set()
 
 
-def test_a_full_disk_is_no_read_only_store() -> None:
+def test_a_full_disk_is_not_treated_as_a_read_only_store() -> None:
     with pytest.raises(OSError, match="full"), unless_read_only():
         raise OSError(errno.ENOSPC, "full")
 
 
-def test_files_are_locked_as_nfs_asks_and_may_go_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """NFS locks a file alone only where it may be written. What another has removed is a link to nothing here."""
+def test_pins_work_on_nfs_and_may_be_removed_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NFS allows an exclusive lock only on a file open for writing. A dangling link stands in for a removed file."""
     lock = fcntl.flock
 
-    def on_nfs(file: IO[str], how: int) -> None:
+    def lock_as_on_nfs(file: IO[str], how: int) -> None:
         if not file.writable():
             raise OSError(errno.EBADF, os.strerror(errno.EBADF))
         lock(file, how)
 
-    monkeypatch.setattr(fcntl, "flock", on_nfs)
+    monkeypatch.setattr(fcntl, "flock", lock_as_on_nfs)
     (tmp_path / FOLDER).mkdir()
     (tmp_path / FOLDER / "0123").write_text("fit/1\n")
     (tmp_path / FOLDER / "4567").symlink_to("gone")
     assert pinned(tmp_path) == set()
 
 
-def test_pins_of_a_store_that_may_only_be_read_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody can tell which of them are of the living."""
+def test_pins_in_a_read_only_store_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without locks, nothing tells which pins belong to running processes."""
     (tmp_path / FOLDER).mkdir()
     (tmp_path / FOLDER / "0123").write_text("fit/1\n")
     plain = Path.open

@@ -42,7 +42,7 @@ def key(task: str = "fit", version: str = "1", **changed: Any) -> str:
         {"several": (artifact(root="/other/store/fit/k"), artifact("b"))},
     ],
 )
-def test_key_is_the_same_wherever_the_bytes_lie(same: dict[str, Any]) -> None:
+def test_key_does_not_depend_on_paths(same: dict[str, Any]) -> None:
     assert key(**same) == key()
 
 
@@ -64,8 +64,8 @@ def test_key_changes_with_name_version_bytes_and_settings(other: dict[str, Any])
     assert key(**other) != key()
 
 
-def test_settings_that_leave_the_result_as_it_is_do_not_count() -> None:
-    """Raising the limit on memory, say, must not train again."""
+def test_settings_that_do_not_affect_the_result_do_not_count() -> None:
+    """For example, a higher memory limit must not cause a new training."""
     for one, other in (
         (TrainingSettings(), TrainingSettings(memory_gib=8, processes=2)),
         (EvaluationSettings(), EvaluationSettings(holdout="each")),
@@ -80,7 +80,7 @@ def test_the_folder_of_a_ground_truth_does_not_count() -> None:
     assert key(truth=ada) == key(truth=bob) != key(truth=bob.model_copy(update={"digest": "e"}))
 
 
-def test_a_file_that_a_setting_names_counts_by_its_bytes(tmp_path: Path) -> None:
+def test_a_file_in_a_setting_counts_by_its_content(tmp_path: Path) -> None:
     for name, content in (("a.npz", b"one"), ("b.npz", b"one"), ("c.npz", b"two")):
         (tmp_path / name).write_bytes(content)
     a, b, c, absent = (key(settings=FitSettings(body_model=tmp_path / f"{name}.npz")) for name in "abcd")
@@ -98,7 +98,7 @@ def test_external_weights_of_a_network_count_too(tmp_path: Path) -> None:
     assert key(settings=one) == key(settings=same) != key(settings=other)
 
 
-def test_inputs_are_told_apart_by_their_part() -> None:
+def test_swapped_inputs_have_another_key() -> None:
     assert key(body=artifact("a"), rough=artifact("b")) != key(body=artifact("b"), rough=artifact("a"))
 
 
@@ -106,9 +106,9 @@ class Shape(Section):
     width: int = 3
 
 
-def test_key_in_numbers() -> None:
-    """Expect the first 32 digits of the SHA-256 of {"inputs": {"settings": {"width": 3}}, "task": "fit", "version":
-    "1"}: a change of this number makes every existing store compute everything again."""
+def test_key_equals_a_known_value() -> None:
+    """The key is the first 32 digits of the SHA-256 of {"inputs": {"settings": {"width": 3}}, "task": "fit", "version":
+    "1"}. If it changes, every existing store computes everything again."""
     assert stage_key("fit", "1", {"settings": Shape()}) == "b8a992a905319034c4fab500077a8ef6"
 
 

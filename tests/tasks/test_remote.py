@@ -12,7 +12,7 @@ from tasks.store import Store
 
 @pytest.fixture
 def captures(s3: str, tmp_path: Path) -> str:
-    """URL of a folder with the captures ada and bob, and what does not belong to any."""
+    """Return the URL of a folder with the captures ada and bob, and objects that belong to no capture."""
     url = f"{s3}-{tmp_path.name}"
     for name in ("ada/intri.yml", "ada/images/01/0.jpg", "bob/a.mp4", "bob/.hidden", "ada/.part/0.jpg", "note.txt"):
         write(f"{url}/{name}", name)
@@ -26,7 +26,7 @@ def write(url: str, text: str) -> None:
     filesystem("s3").call_s3("put_object", Bucket=bucket, Key=key, Body=text.encode())
 
 
-def test_captures_are_the_folders_and_their_files_are_fetched_once(captures: str, tmp_path: Path) -> None:
+def test_every_folder_is_a_capture_and_its_files_are_fetched_once(captures: str, tmp_path: Path) -> None:
     ada, bob = remote_captures(captures)
     assert [(one.url, [file.name for file in one.files]) for one in (ada, bob)] == [
         (f"{captures}/ada", ["images/01/0.jpg", "intri.yml"]),
@@ -41,7 +41,7 @@ def test_captures_are_the_folders_and_their_files_are_fetched_once(captures: str
     assert fetched(store, remote_capture(f"{captures}/ada/")).stat().st_ino == inode
 
 
-def test_what_is_in_a_bucket_already_is_not_put_into_the_shared_one(
+def test_fetched_captures_are_not_uploaded_to_the_shared_bucket(
     captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "shared").mkdir()
@@ -50,7 +50,7 @@ def test_what_is_in_a_bucket_already_is_not_put_into_the_shared_one(
     assert not list((tmp_path / "shared").iterdir())
 
 
-def test_what_changes_is_another_capture_even_at_the_same_size(captures: str, tmp_path: Path) -> None:
+def test_changed_content_of_the_same_size_is_another_capture(captures: str, tmp_path: Path) -> None:
     before = remote_capture(f"{captures}/bob")
     write(f"{captures}/bob/a.mp4", "BOB/A.MP4")
     after = remote_capture(f"{captures}/bob")
@@ -61,7 +61,7 @@ def test_what_changes_is_another_capture_even_at_the_same_size(captures: str, tm
 
 
 @pytest.mark.parametrize("change", ["replaced", "removed"])
-def test_what_changes_while_it_is_fetched_is_refused(
+def test_a_capture_that_changes_while_it_is_fetched_is_refused(
     captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
     bob = remote_capture(f"{captures}/bob")
@@ -81,7 +81,7 @@ def test_what_changes_while_it_is_fetched_is_refused(
 
 
 @pytest.mark.parametrize("url", ["nobody", "ada/..", "bob/a.mp4", "ada?versionId=1", "empty"])
-def test_where_no_folder_is_there_is_no_capture(captures: str, url: str) -> None:
+def test_a_url_without_a_folder_is_refused(captures: str, url: str) -> None:
     with pytest.raises(NothingThereError, match="no such folder; give the capture's folder"):
         remote_capture(f"{captures}/{url}")
 
@@ -93,7 +93,7 @@ def test_a_file_that_is_also_a_folder_is_refused(captures: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("url", ["ftp://user:secret@host/captures/ada", "s3://tests/a::b"])
-def test_urls_that_would_be_misread_or_tell_a_password_are_refused(url: str) -> None:
+def test_ambiguous_urls_and_urls_with_a_password_are_refused(url: str) -> None:
     with pytest.raises(InputError, match=r"^a URL with a password or `::` is refused") as refused:
         remote_capture(url)
     assert "secret" not in str(refused.value)
@@ -105,7 +105,7 @@ def test_a_file_system_without_etags_is_refused(tmp_path: Path) -> None:
         list(remote_captures("memory://bare"))
 
 
-def test_a_long_download_reports_how_far_it_is(captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_download_reports_its_progress(captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[str, float, float]] = []
     monkeypatch.setattr("tasks.bucket.report", lambda *given: seen.append(given))
     fetched(Store(tmp_path / "store"), remote_capture(f"{captures}/bob"))

@@ -54,7 +54,7 @@ def write(out: Path) -> dict[str, float]:
 
 
 def made(bucket: Bucket, store: Store, work: Callable[[Path], dict[str, float]] = write) -> Artifact:
-    """Return the artifact, which was computed from another."""
+    """Get or compute the artifact `fit/KEY`, which was computed from another one."""
     inputs = [f"capture/{1:032x}"]
     return get_or_compute(bucket, store, "fit", KEY, lambda: store.get_or_compute("fit", KEY, work, inputs=inputs))
 
@@ -67,7 +67,7 @@ def clean(store: Store) -> bool:
     return not faults(store).lines and not find_garbage(Inventory.of(store), 1, 0)[1:]
 
 
-def test_what_one_machine_made_another_takes(bucket: Bucket, tmp_path: Path) -> None:
+def test_one_machine_uses_the_artifact_of_another(bucket: Bucket, tmp_path: Path) -> None:
     here, there = Store(tmp_path / "here"), Store(tmp_path / "there")
     first, second = made(bucket, here), made(bucket, there, never)
     assert second.root == there.path("fit", KEY)
@@ -78,7 +78,7 @@ def test_what_one_machine_made_another_takes(bucket: Bucket, tmp_path: Path) -> 
     assert made(bucket, here, never) == first
 
 
-def test_what_was_made_before_is_shared_when_it_is_used(bucket: Bucket, tmp_path: Path) -> None:
+def test_an_artifact_of_the_local_store_is_shared_on_use(bucket: Bucket, tmp_path: Path) -> None:
     store = Store(tmp_path / "here")
     store.get_or_compute("fit", KEY, write)
     made(bucket, store, never)
@@ -102,7 +102,7 @@ def damage(bucket: Bucket, change: Callable[[bytes], bytes]) -> None:
         lambda whole: b"\x80\x04cposix\nsystem\n" * 99,
     ],
 )
-def test_a_damaged_object_is_refused_and_made_anew(
+def test_a_damaged_object_is_refused_and_computed_again(
     tmp_path: Path, change: Callable[[bytes], bytes], caplog: pytest.LogCaptureFixture
 ) -> None:
     bucket = disk_bucket(tmp_path)
@@ -115,7 +115,7 @@ def test_a_damaged_object_is_refused_and_made_anew(
     made(bucket, Store(tmp_path / "third"), never)
 
 
-def test_an_object_in_another_ones_place_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_object_under_a_wrong_name_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bucket = disk_bucket(tmp_path)
     made(bucket, Store(tmp_path / "here"))
     other = f"{8:032x}"
@@ -125,7 +125,7 @@ def test_an_object_in_another_ones_place_is_refused(tmp_path: Path, caplog: pyte
     assert found.files == {} and "holds something else" in caplog.text
 
 
-def test_nothing_is_fetched_that_would_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_object_that_would_fill_the_disk_is_not_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bucket = disk_bucket(tmp_path)
     made(bucket, Store(tmp_path / "here"))
     monkeypatch.setattr(packed, "SPARE_BYTES", 1 << 60)
@@ -133,8 +133,8 @@ def test_nothing_is_fetched_that_would_fill_the_disk(tmp_path: Path, monkeypatch
         made(bucket, Store(tmp_path / "there"))
 
 
-def test_nothing_is_unpacked_that_would_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The object holds once what is unpacked fifty times."""
+def test_an_object_that_would_fill_the_disk_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The object holds one copy of a file that is unpacked fifty times."""
 
     def many(out: Path) -> dict[str, float]:
         for number in range(50):
@@ -150,14 +150,14 @@ def test_nothing_is_unpacked_that_would_fill_the_disk(tmp_path: Path, monkeypatc
         made(bucket, Store(tmp_path / "there"), never)
 
 
-def test_failed_work_is_left_to_the_next(bucket: Bucket, tmp_path: Path) -> None:
+def test_failed_work_can_be_done_by_another_machine(bucket: Bucket, tmp_path: Path) -> None:
     with pytest.raises(RuntimeError):
         made(bucket, Store(tmp_path / "here"), Mock(side_effect=RuntimeError("crash")))
     made(bucket, Store(tmp_path / "there"))
     assert bucket.read_note(f"fit/{KEY}.lease.0") is bucket.read_note(f"fit/{KEY}.lease.1") is None
 
 
-def test_a_result_that_could_not_be_shared_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_result_whose_upload_failed_is_shared_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
     with monkeypatch.context() as patch:
         patch.setattr(type(bucket.fs), "put_file", lambda *_: (_ for _ in ()).throw(TimeoutError("too slow")))
@@ -170,7 +170,7 @@ def test_a_result_that_could_not_be_shared_is_not_lost(tmp_path: Path, monkeypat
 def resumed(
     bucket: Bucket, store: Store, work: Callable[[Path], dict[str, float]], stage: str = "training"
 ) -> Artifact:
-    """Return the artifact of a stage that resumes from `checkpoint`."""
+    """Get or compute the artifact of a stage that resumes from the file `checkpoint`."""
 
     def compute() -> Artifact:
         return store.get_or_compute(stage, KEY, work, resumable=True)
@@ -183,18 +183,18 @@ def finish(out: Path) -> dict[str, float]:
     return write(out)
 
 
-def kept(bucket: Bucket) -> bytes | None:
+def shared_checkpoint_bytes(bucket: Bucket) -> bytes | None:
     return bucket.read_note(CHECKPOINT)
 
 
-def soon(reached: Callable[[], bool]) -> None:
+def wait_until(reached: Callable[[], bool]) -> None:
     deadline_s = time.monotonic() + 20
     while not reached():
         assert time.monotonic() < deadline_s
         time.sleep(0.01)
 
 
-def test_another_machine_goes_on_from_the_checkpoint_of_failed_work(bucket: Bucket, tmp_path: Path) -> None:
+def test_another_machine_resumes_failed_work_from_its_checkpoint(bucket: Bucket, tmp_path: Path) -> None:
     def fail(out: Path) -> dict[str, float]:
         (out / "checkpoint").write_text("step 100")
         raise RuntimeError("crash")
@@ -207,16 +207,16 @@ def test_another_machine_goes_on_from_the_checkpoint_of_failed_work(bucket: Buck
     here, there = Store(tmp_path / "here"), Store(tmp_path / "there")
     with pytest.raises(RuntimeError):
         resumed(bucket, here, fail)
-    assert kept(bucket) == b"step 100"
+    assert shared_checkpoint_bytes(bucket) == b"step 100"
     assert resumed(bucket, there, go_on).files.keys() == {"again", "deep/letters"}
-    assert kept(bucket) is None and clean(there)
+    assert shared_checkpoint_bytes(bucket) is None and clean(there)
     resumed(bucket, here, never)
     for store in (here, there):
         assert {path.name for path in (store.root / "training").iterdir()} == {KEY, f"{KEY}.json", f"{KEY}.lock"}
 
 
-def test_the_checkpoint_is_that_of_the_machine_that_worked_last(bucket: Bucket, tmp_path: Path) -> None:
-    """A newer own one stays, which the bucket could not take, and is put there, too; another machine's replaces it."""
+def test_work_resumes_from_the_checkpoint_of_the_machine_that_worked_last(bucket: Bucket, tmp_path: Path) -> None:
+    """A newer local checkpoint, which did not reach the bucket, is kept and uploaded; another machine's replaces it."""
     begun = []
 
     def fail(out: Path) -> dict[str, float]:
@@ -234,26 +234,24 @@ def test_the_checkpoint_is_that_of_the_machine_that_worked_last(bucket: Bucket, 
     attempt(here)
     own.write_text("step 900")
     attempt(here)
-    assert begun == ["", "step 900"] and kept(bucket) == b"step 900"
+    assert begun == ["", "step 900"] and shared_checkpoint_bytes(bucket) == b"step 900"
     attempt(there)
     bucket.upload(write_file(tmp_path / "elsewhere", "step 2000"), CHECKPOINT)
     attempt(here)
     assert begun[2:] == ["step 900", "step 2000"] and own.read_text() == "step 2000"
     bucket.remove(CHECKPOINT)
     attempt(here)
-    assert kept(bucket) == b"step 2000"
+    assert shared_checkpoint_bytes(bucket) == b"step 2000"
 
 
-def test_a_checkpoint_that_is_removed_while_it_is_fetched_was_of_finished_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_may_be_removed_while_it_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
     monkeypatch.setattr(Bucket, "size_bytes", lambda self, name: 8 if name == CHECKPOINT else None)
     resumed(bucket, store, write)
     assert clean(store)
 
 
-def test_the_bucket_has_each_new_checkpoint_once_while_work_goes_on(
+def test_each_new_checkpoint_is_uploaded_once_during_the_work(
     bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     uploads, upload = [], Bucket.upload
@@ -266,17 +264,17 @@ def test_the_bucket_has_each_new_checkpoint_once_while_work_goes_on(
         for text in ("step 100", "step 200"):
             (out / "beside").write_text(text)
             os.replace(out / "beside", out / "checkpoint")
-            soon(lambda text=text: kept(bucket) == text.encode())  # type: ignore[misc]
+            wait_until(lambda text=text: shared_checkpoint_bytes(bucket) == text.encode())  # type: ignore[misc]
             time.sleep(0.05)
         return finish(out)
 
     monkeypatch.setattr(shared_checkpoint, "LOOK_S", 0.01)
     monkeypatch.setattr(Bucket, "upload", counted)
     resumed(bucket, Store(tmp_path / "here"), work)
-    assert kept(bucket) is None and uploads == [CHECKPOINT, CHECKPOINT, f"training/{KEY}.tar"]
+    assert shared_checkpoint_bytes(bucket) is None and uploads == [CHECKPOINT, CHECKPOINT, f"training/{KEY}.tar"]
 
 
-def test_a_checkpoint_that_is_replaced_during_its_upload_arrives_whole(
+def test_a_checkpoint_replaced_during_its_upload_arrives_intact(
     bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkpoint, upload = tmp_path / "checkpoint", Bucket.upload
@@ -289,7 +287,7 @@ def test_a_checkpoint_that_is_replaced_during_its_upload_arrives_whole(
 
     monkeypatch.setattr(Bucket, "upload", replaced)
     shared_checkpoint._put(bucket, CHECKPOINT, checkpoint, tmp_path / "known")
-    assert kept(bucket) == b"old and long" and checkpoint.read_text() == "new"
+    assert shared_checkpoint_bytes(bucket) == b"old and long" and checkpoint.read_text() == "new"
 
 
 def test_refused_work_leaves_no_checkpoint(tmp_path: Path) -> None:
@@ -298,10 +296,10 @@ def test_refused_work_leaves_no_checkpoint(tmp_path: Path) -> None:
 
     with pytest.raises(InputError, match="nobody"):
         resumed(bucket, store, Mock(side_effect=InputError("nobody is in the pictures")))
-    assert kept(bucket) is None and not store.path("training", KEY, ".partial").exists()
+    assert shared_checkpoint_bytes(bucket) is None and not store.path("training", KEY, ".partial").exists()
 
 
-def test_work_goes_on_where_the_bucket_takes_no_checkpoint(
+def test_work_continues_if_the_checkpoint_cannot_be_uploaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(shared_checkpoint, "LOOK_S", 0.01)
@@ -314,7 +312,7 @@ def test_work_goes_on_where_the_bucket_takes_no_checkpoint(
 
     def work(out: Path) -> dict[str, float]:
         (out / "checkpoint").write_text("step 100")
-        soon(lambda: "too slow" in caplog.text)
+        wait_until(lambda: "too slow" in caplog.text)
         return finish(out)
 
     monkeypatch.setattr(Bucket, "upload", slow)
@@ -322,7 +320,9 @@ def test_work_goes_on_where_the_bucket_takes_no_checkpoint(
     resumed(bucket, Store(tmp_path / "there"), never)
 
 
-def test_checkpoints_are_shared_again_once_this_disk_has_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoints_are_shared_again_once_the_local_disk_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     full, store = [OSError(errno.ENOSPC, "No space left on device")], Store(tmp_path / "here")
 
     def note(path: Path, text: str) -> None:
@@ -332,7 +332,7 @@ def test_checkpoints_are_shared_again_once_this_disk_has_room(tmp_path: Path, mo
 
     def work(out: Path) -> dict[str, float]:
         (out / "checkpoint").write_text("step 100")
-        soon(store.path("training", KEY, ".shared").exists)
+        wait_until(store.path("training", KEY, ".shared").exists)
         return finish(out)
 
     monkeypatch.setattr(shared_checkpoint, "LOOK_S", 0.01)
@@ -340,7 +340,7 @@ def test_checkpoints_are_shared_again_once_this_disk_has_room(tmp_path: Path, mo
     resumed(disk_bucket(tmp_path), store, work)
 
 
-def test_a_fetched_checkpoint_does_not_follow_links(tmp_path: Path) -> None:
+def test_a_fetched_checkpoint_is_not_written_through_links(tmp_path: Path) -> None:
     bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
     bucket.upload(write_file(tmp_path / "elsewhere", "step 100"), CHECKPOINT)
     outside = tmp_path / "outside"
@@ -367,7 +367,7 @@ def write_file(path: Path, text: str) -> Path:
 
 
 def work_in(root: Path, store: str, expiry_s: float) -> None:
-    """Make the artifact, slowly, and leave a line in `<root>/done`; in a process of its own."""
+    """Compute the artifact slowly, and add a line to `<root>/done`; runs in a process of its own."""
 
     def slowly(out: Path) -> dict[str, float]:
         time.sleep(0.3)
@@ -379,7 +379,7 @@ def work_in(root: Path, store: str, expiry_s: float) -> None:
     made(disk_bucket(root), Store(root / store), slowly)
 
 
-def test_two_workers_with_separate_stores_work_once(tmp_path: Path) -> None:
+def test_two_workers_with_separate_stores_compute_an_artifact_once(tmp_path: Path) -> None:
     workers = [SPAWN.Process(target=work_in, args=(tmp_path, name, 5.0)) for name in ("here", "there")]
     for worker in workers:
         worker.start()

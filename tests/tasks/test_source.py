@@ -24,7 +24,7 @@ def digest(folder: Path) -> str:
     return read_capture(folder)[0].digest
 
 
-def test_digest_is_of_content_not_place_or_time(folder: Path, tmp_path: Path) -> None:
+def test_digest_depends_on_content_not_on_place_or_time(folder: Path, tmp_path: Path) -> None:
     before = digest(folder)
     os.utime(folder / "intri.yml", (0, 0))
     moved = folder.rename(tmp_path / "elsewhere")
@@ -32,7 +32,7 @@ def test_digest_is_of_content_not_place_or_time(folder: Path, tmp_path: Path) ->
     assert read_capture(moved)[0].name == "elsewhere"
 
 
-def test_one_video_is_a_capture(tmp_path: Path) -> None:
+def test_a_single_video_is_a_capture(tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(b"pixels")
     (tmp_path / "other.mp4").write_bytes(b"of no concern")
     recorded, truth = read_capture(tmp_path / "clip.mp4")
@@ -49,7 +49,7 @@ def test_hidden_files_do_not_count(folder: Path) -> None:
     assert digest(folder) == before
 
 
-def test_recording_and_ground_truth_have_digests_of_their_own(folder: Path) -> None:
+def test_recording_and_ground_truth_have_separate_digests(folder: Path) -> None:
     recorded, truth = read_capture(folder)
     (folder / "ground_truth" / "mesh.ply").write_text("other")
     recorded_now, truth_now = read_capture(folder)
@@ -86,7 +86,7 @@ def test_a_recording_that_changed_meanwhile_is_refused(folder: Path) -> None:
         require_unchanged(recorded)
 
 
-def test_one_video_and_no_ground_truth_stay_so(tmp_path: Path) -> None:
+def test_an_unchanged_video_without_ground_truth_is_accepted(tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(b"pixels")
     for part in read_capture(tmp_path / "clip.mp4"):
         require_unchanged(part)
@@ -116,7 +116,7 @@ def test_links_and_devices_are_not_followed(folder: Path) -> None:
     assert digest(folder)
 
 
-def test_a_name_that_is_not_utf_8_counts_by_its_bytes(folder: Path) -> None:
+def test_a_file_name_that_is_not_utf_8_counts_by_its_bytes(folder: Path) -> None:
     before = digest(folder)
     (folder / os.fsdecode(b"caf\xe9.txt")).touch()
     named = digest(folder)
@@ -130,7 +130,7 @@ def test_a_folder_whose_name_is_not_utf_8_is_bad_input(folder: Path) -> None:
 
 
 def test_a_line_break_in_a_name_is_bad_input(folder: Path) -> None:
-    """Else one file could be listed as two others are."""
+    """Otherwise the listing of one file could equal that of two others."""
     (folder / "a\nb").touch()
     with pytest.raises(InputError, match="a b: has a line break in its name"):
         digest(folder)
@@ -143,14 +143,14 @@ def test_a_line_break_in_a_name_is_bad_input(folder: Path) -> None:
         digest(folder.rename(folder.with_name("a\nb")))
 
 
-def test_a_file_that_takes_hours_to_read_is_bad_input(folder: Path) -> None:
+def test_a_file_that_is_too_large_is_bad_input(folder: Path) -> None:
     with (folder / "sparse.mp4").open("wb") as file:
         file.truncate(module.MAX_FILE_BYTES + 1)
     with pytest.raises(InputError, match=r"sparse\.mp4: has more than 256 GiB"):
         digest(folder)
 
 
-def test_what_cannot_be_read_is_bad_input(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_files_and_folders_are_bad_input(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refused = Mock(side_effect=PermissionError(13, "Permission denied", "images"))
 
     with monkeypatch.context() as locked, pytest.raises(InputError, match=r"0\.jpg: cannot be read \(Permission"):
@@ -173,6 +173,6 @@ def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
         read_capture(tmp_path / "absent")
 
 
-def test_what_is_on_a_disk_is_a_path() -> None:
+def test_a_local_place_is_a_path_and_a_remote_one_a_url() -> None:
     given = ("s3://b/ada", "file:///ada", "ada", Path("ada"))
     assert [place(one) for one in given] == ["s3://b/ada", Path("/ada"), Path("ada"), Path("ada")]

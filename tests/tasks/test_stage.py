@@ -27,27 +27,29 @@ def source(tmp_path: Path) -> Source:
 
 @flow
 def chain(store: Path, source: Source) -> tuple[str, str]:
-    """Run both fakes in a flow; return the text and the flow run's id."""
+    """Run two fake stages in a flow; return the resulting text and the id of the flow run."""
     doubled = double(Store(store), copy(Store(store), source, CaptureSettings()))
     context = FlowRunContext.get()
     return (doubled.root / "text").read_text(), str(context.flow_run.id) if context and context.flow_run else ""
 
 
 def states(flow_run_id: str) -> list[str]:
-    """Return the state names of a flow run's tasks, in order."""
+    """Return the names of the states of a flow run's tasks, in order of their start."""
     chosen = FlowRunFilter(id=FlowRunFilterId(any_=[flow_run_id]))
     with get_client(sync_client=True) as client:
         runs = client.read_task_runs(flow_run_filter=chosen)
     return [run.state_name or "" for run in sorted(runs, key=lambda run: run.start_time or run.expected_start_time)]
 
 
-def test_without_a_server_work_is_done_once(tmp_path: Path, source: Source) -> None:
+def test_without_a_server_each_stage_runs_once(tmp_path: Path, source: Source) -> None:
     assert chain.fn(tmp_path, source) == ("ABAB", "")
     assert chain.fn(tmp_path, source) == ("ABAB", "")
     assert calls(tmp_path) == ["copied", "doubled"]
 
 
-def test_other_settings_do_the_work_again_but_equal_content_stops_there(tmp_path: Path, source: Source) -> None:
+def test_other_settings_repeat_a_stage_but_not_later_ones_if_its_result_is_equal(
+    tmp_path: Path, source: Source
+) -> None:
     store = Store(tmp_path)
     first = double(store, copy(store, source, CaptureSettings()))
     second = double(store, copy(store, source, CaptureSettings(max_side_px=64)))
@@ -55,8 +57,8 @@ def test_other_settings_do_the_work_again_but_equal_content_stops_there(tmp_path
     assert first == second
 
 
-def test_images_are_those_of_the_largest_recording(tmp_path: Path) -> None:
-    """Of two cameras each, 2 and 5 frames: 10 images."""
+def test_the_image_count_is_that_of_the_largest_recording(tmp_path: Path) -> None:
+    """Two recordings with two cameras each and 2 and 5 frames: 10 images."""
     recordings = []
     for frames in (2, 5):
         (tmp_path / str(frames)).mkdir()
@@ -66,7 +68,9 @@ def test_images_are_those_of_the_largest_recording(tmp_path: Path) -> None:
     assert image_count([*recordings, None]) == 10 and image_count([CaptureSettings()]) == 1
 
 
-def test_machines_with_a_bucket_work_once(tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_machines_that_share_a_bucket_run_each_stage_once(
+    tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "bucket").mkdir()
     monkeypatch.setenv(VARIABLE, f"file://{tmp_path}/bucket")
     assert chain.fn(tmp_path / "here", source) == chain.fn(tmp_path / "there", source) == ("ABAB", "")
@@ -74,10 +78,10 @@ def test_machines_with_a_bucket_work_once(tmp_path: Path, source: Source, monkey
     assert calls(tmp_path / "there") == []
 
 
-def test_a_network_that_comes_makes_another_artifact(
+def test_an_installed_network_changes_the_artifact(
     tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Expect the same artifact while the network is absent."""
+    """While the network is absent, the artifact stays the same."""
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "networks"))
     store, scored = Store(tmp_path), Stage(copy.write, "copied", "1", False, networks=("eye.ckpt",))
     without = scored(store, source, CaptureSettings())
@@ -110,7 +114,7 @@ def test_second_flow_run_is_cached_until_an_artifact_is_damaged(
     assert calls(tmp_path) == ["copied", "doubled", "copied"]
 
 
-def test_a_flow_run_puts_what_the_bucket_lacks_there(
+def test_a_flow_run_uploads_artifacts_that_the_bucket_lacks(
     prefect_api: str, tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chain(tmp_path, source)
@@ -121,12 +125,12 @@ def test_a_flow_run_puts_what_the_bucket_lacks_there(
     assert calls(tmp_path) == ["copied", "doubled"]
 
 
-def test_artifact_made_anew_outside_prefect_replaces_its_record(
+def test_an_artifact_recomputed_outside_prefect_replaces_its_record(
     prefect_api: str, tmp_path: Path, source: Source
 ) -> None:
     chain(tmp_path, source)
     shutil.rmtree(tmp_path / "copied")
-    (source.root / "text").write_text("cd")  # as if the stage were not repeatable: the source record stays as it was
+    (source.root / "text").write_text("cd")  # as if the stage were not deterministic: `source` keeps its old digest
     copy(Store(tmp_path), source, CaptureSettings())
     assert chain(tmp_path, source)[0] == "CDCD"
 
@@ -139,7 +143,7 @@ def test_stores_do_not_share_prefect_records(prefect_api: str, tmp_path: Path, s
 
 
 @flow
-def one_flaky(store: Path, source: Source) -> None:
+def flow_with_flaky_stage(store: Path, source: Source) -> None:
     """Run a stage that fails once."""
     flaky(Store(store), source)
 
@@ -147,7 +151,7 @@ def one_flaky(store: Path, source: Source) -> None:
 @pytest.mark.parametrize(
     ("fault", "error", "attempts"), [("io", None, 2), ("bad", InputError, 1), ("gone", FileNotFoundError, 1)]
 )
-def test_only_transient_faults_are_tried_again(
+def test_only_transient_errors_are_retried(
     prefect_api: str,
     tmp_path: Path,
     source: Source,
@@ -160,13 +164,13 @@ def test_only_transient_faults_are_tried_again(
     (source.root / "text").write_text(fault)
     if error:
         with pytest.raises(error):
-            one_flaky(tmp_path, read_capture(source.root)[0])
+            flow_with_flaky_stage(tmp_path, read_capture(source.root)[0])
     else:
-        one_flaky(tmp_path, read_capture(source.root)[0])
+        flow_with_flaky_stage(tmp_path, read_capture(source.root)[0])
     assert calls(tmp_path) == attempts * ["flaky"]
 
 
-def test_a_refusal_is_logged_without_tracebacks(
+def test_a_refusal_is_logged_without_a_traceback(
     prefect_api: str, tmp_path: Path, source: Source, capfd: pytest.CaptureFixture[str]
 ) -> None:
     lines: list[str] = []
@@ -178,7 +182,7 @@ def test_a_refusal_is_logged_without_tracebacks(
         logger.addHandler(handler)
     try:
         with pytest.raises(InputError):
-            one_flaky(tmp_path, read_capture(source.root)[0])
+            flow_with_flaky_stage(tmp_path, read_capture(source.root)[0])
     finally:
         for logger in loggers:
             logger.removeHandler(handler)

@@ -17,7 +17,7 @@ import pytest
 from hnerf.errors import InputError
 from tasks.store import RECORDING, Artifact, Store, recording_digest, remove, require_intact
 
-# Not forked: a child would inherit Prefect's threads half-way.
+# Not forked: a child would inherit the state of Prefect's threads, but not the threads.
 SPAWN = multiprocessing.get_context("spawn")
 # SHA-256 of b"abc" (FIPS 180-2, example B.1).
 ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
@@ -42,7 +42,7 @@ def test_artifact_is_recorded_with_digests_and_found_again(tmp_path: Path) -> No
     assert made.metrics == {"letters": 3.0}
 
 
-def test_digest_is_of_names_and_bytes_only(tmp_path: Path) -> None:
+def test_digest_depends_only_on_names_and_bytes(tmp_path: Path) -> None:
     first = Store(tmp_path / "a").get_or_compute("fit", "k", write_abc)
     second = Store(tmp_path / "b").get_or_compute("fit", "other", lambda out: write_abc(out) and {})
     renamed = first.model_copy(update={"files": {"deep/lettres": first.files["deep/letters"]}})
@@ -69,8 +69,8 @@ def test_half_written_artifact_is_not_seen(tmp_path: Path, error: BaseException)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_store_that_vanishes_is_not_taken_for_a_file_that_is_missing(tmp_path: Path) -> None:
-    """The fault itself is tried again; that nothing is left to be removed hides none."""
+def test_a_vanished_store_does_not_hide_the_original_error(tmp_path: Path) -> None:
+    """The original error is raised, so that it can be retried; that the folder is already gone does not hide it."""
 
     def lose(out: Path) -> dict[str, float]:
         shutil.rmtree(tmp_path / "share")
@@ -80,8 +80,8 @@ def test_a_store_that_vanishes_is_not_taken_for_a_file_that_is_missing(tmp_path:
         Store(tmp_path / "share").get_or_compute("fit", "k", lose)
 
 
-def test_failures_at_once_keep_apart_and_leave_no_lock(tmp_path: Path) -> None:
-    """Each removes the lock that others wait for, and the folder in which they are about to make theirs."""
+def test_concurrent_failures_exclude_each_other_and_leave_no_lock(tmp_path: Path) -> None:
+    """Each failure removes the lock that others wait for, and the folder in which they are about to create theirs."""
     alone = threading.Lock()
 
     def fail(out: Path) -> dict[str, float]:
@@ -99,7 +99,7 @@ def test_failures_at_once_keep_apart_and_leave_no_lock(tmp_path: Path) -> None:
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
-def test_resumable_stage_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_resumable_stage_continues_from_its_partial_folder(tmp_path: Path) -> None:
     def interrupted(out: Path) -> dict[str, float]:
         write_abc(out)
         raise OSError("worker lost")
@@ -118,8 +118,8 @@ def test_resumable_stage_goes_on_where_it_was(tmp_path: Path) -> None:
 def test_finished_work_that_could_not_be_recorded_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: int
 ) -> None:
-    """Let the disk be full, or the process killed, before the use is noted, before the record and before the folder
-    get their names."""
+    """The disk is full, or the process is killed, before one of three renames: of the note of the use, of the record, or
+    of the folder."""
 
     def work(out: Path) -> dict[str, float]:
         resumed = (out / "checkpoint.pt").exists()
@@ -140,7 +140,7 @@ def test_finished_work_that_could_not_be_recorded_resumes(
     assert [path.name for path in made.root.iterdir()] == ["model"]
 
 
-def test_what_a_killed_commit_left_of_a_checkpoint_goes_with_the_next_use(tmp_path: Path) -> None:
+def test_the_checkpoint_left_by_a_killed_commit_is_removed_on_the_next_use(tmp_path: Path) -> None:
     def compute() -> Artifact:
         return Store(tmp_path).get_or_compute("training", "k", write_abc, resumable=True, checkpoint="checkpoint.pt")
 
@@ -151,7 +151,7 @@ def test_what_a_killed_commit_left_of_a_checkpoint_goes_with_the_next_use(tmp_pa
     assert sorted(path.name for path in made.root.iterdir()) == recorded
 
 
-def test_bad_input_leaves_nothing_to_be_resumed(tmp_path: Path) -> None:
+def test_bad_input_leaves_no_partial_folder(tmp_path: Path) -> None:
     def refused(out: Path) -> dict[str, float]:
         write_abc(out)
         raise InputError("a.jpg: bad")
@@ -161,7 +161,7 @@ def test_bad_input_leaves_nothing_to_be_resumed(tmp_path: Path) -> None:
     assert not (tmp_path / "training" / "k.partial").exists()
 
 
-def test_a_record_of_another_stage_is_none(tmp_path: Path) -> None:
+def test_a_record_of_another_stage_is_ignored(tmp_path: Path) -> None:
     made = Store(tmp_path).get_or_compute("training", "k", write_abc)
     shutil.copytree(tmp_path / "training", tmp_path / "fit")
     assert Store(tmp_path).find("training", "k") == made and Store(tmp_path).find("fit", "k") is None
@@ -177,10 +177,10 @@ NO_RECORDS = ("abd", "[]", "null", "3", '"text"', "[" * 100_000, '{"stage": "fit
         ("k/deep/letters", lambda path: path.write_text("abd")),
         ("k.json", Path.unlink),
         *(("k.json", partial(Path.write_text, data=text)) for text in NO_RECORDS),
-        ("k.json", lambda path: os.truncate(path, 10**13)),  # it occupies nothing, and is not read
+        ("k.json", lambda path: os.truncate(path, 10**13)),  # sparse: it takes no space, and must not be read
     ],
 )
-def test_damaged_or_deleted_artifact_is_made_again(
+def test_a_damaged_or_deleted_artifact_is_computed_again(
     tmp_path: Path, victim: str, damage: Callable[[Path], object]
 ) -> None:
     made = Store(tmp_path).get_or_compute("fit", "k", write_abc)
@@ -204,7 +204,7 @@ def test_links_planted_in_the_store_are_not_followed(tmp_path: Path) -> None:
     assert (victim / "letters").read_text() == "mine"
 
 
-def test_a_link_in_work_to_be_resumed_is_removed(tmp_path: Path) -> None:
+def test_links_in_a_partial_folder_are_removed(tmp_path: Path) -> None:
     (tmp_path / "victim").write_text("mine")
     (tmp_path / "training" / "k.partial").mkdir(parents=True)
     (tmp_path / "training" / "k.partial" / "checkpoint.pt.tmp").symlink_to(tmp_path / "victim")
@@ -226,8 +226,8 @@ def test_a_link_in_place_of_a_lock_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "victim").read_text() == "mine"
 
 
-def test_a_complete_store_may_be_read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Root may write anywhere, so that whatever writes is made to fail here."""
+def test_a_complete_store_can_be_read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests may run as root, who may write anywhere, so every function that writes is made to fail."""
     store = Store(tmp_path)
     made = store.link_latest("ada", store.get_or_compute("fit", "k", write_abc))
     store.claim("ada", "d", tmp_path / "captures" / "ada")
@@ -239,7 +239,7 @@ def test_a_complete_store_may_be_read_only(tmp_path: Path, monkeypatch: pytest.M
     assert store.link_latest("ada", made) == made
 
 
-def test_two_recordings_of_one_name_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_second_recording_of_the_same_name_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store, mine, theirs = Store(tmp_path), tmp_path / "mine" / "ada", tmp_path / "theirs" / "ada"
     store.claim("ada", "d" * 64, mine)
     store.claim("ada", "e" * 64, mine)  # the same folder, changed
@@ -252,7 +252,7 @@ def test_two_recordings_of_one_name_are_said(tmp_path: Path, caplog: pytest.LogC
 def test_a_table_of_another_recording_is_kept(tmp_path: Path) -> None:
     store, table = Store(tmp_path), tmp_path / "ablations" / "ada.b-fast.md"
     mine, theirs = tmp_path / "mine" / "ada", tmp_path / "theirs" / "ada"
-    store.claim_table(table, "c" * 64, theirs)  # and is interrupted before its first row
+    store.claim_table(table, "c" * 64, theirs)  # interrupted before its first row
     store.claim_table(table, "d" * 64, mine)
     table.touch()
     store.claim_table(table, "e" * 64, mine)  # the same folder, changed
@@ -261,7 +261,7 @@ def test_a_table_of_another_recording_is_kept(tmp_path: Path) -> None:
         InputError, match=f"ada.b-fast.md: is of {tmp_path}/moved/ada, not of {theirs}; give one of them"
     ):
         store.claim_table(table, "f" * 64, theirs)
-    table.with_suffix(".recording").unlink()  # as beside a table of an earlier version
+    table.with_suffix(".recording").unlink()  # as for a table of an earlier version
     store.claim_table(table, "f" * 64, theirs)
 
 
@@ -274,8 +274,8 @@ def test_a_damaged_note_of_the_recording_is_written_again(tmp_path: Path) -> Non
     assert note.read_text() == f"{'d' * 64}\n{tmp_path / 'ada'}\n"
 
 
-def test_a_link_in_place_of_an_artifact_is_none(tmp_path: Path) -> None:
-    """Neither its folder nor its record may lie elsewhere."""
+def test_a_link_in_place_of_an_artifact_is_ignored(tmp_path: Path) -> None:
+    """Neither the folder nor the record of an artifact may be a link."""
     made = Store(tmp_path / "elsewhere").get_or_compute("fit", "k", write_abc)
     fit, store = tmp_path / "store" / "fit", Store(tmp_path / "store")
     for linked in ("k", "k.json"):
@@ -288,7 +288,7 @@ def test_a_link_in_place_of_an_artifact_is_none(tmp_path: Path) -> None:
 
 
 def test_directory_without_record_is_not_an_artifact(tmp_path: Path) -> None:
-    """Leave what a removal leaves that was killed half-way."""
+    """As after a removal that was killed half-way."""
     (tmp_path / "fit" / "k").mkdir(parents=True)
     (tmp_path / "fit" / "k" / "stale").write_text("x")
     assert list(Store(tmp_path).get_or_compute("fit", "k", write_abc).files) == ["deep/letters"]
@@ -305,7 +305,7 @@ def slow_work(root: Path) -> None:
     Store(root).get_or_compute("fit", "k", write)
 
 
-def test_two_processes_at_once_do_the_work_once(tmp_path: Path) -> None:
+def test_two_concurrent_processes_compute_an_artifact_once(tmp_path: Path) -> None:
     both = [SPAWN.Process(target=slow_work, args=(tmp_path,)) for _ in range(2)]
     for process in both:
         process.start()
@@ -338,7 +338,7 @@ def test_sigkill_leaves_no_lock_and_no_artifact(tmp_path: Path) -> None:
     assert time.monotonic() - began < 5
 
 
-def test_view_points_at_the_latest(tmp_path: Path) -> None:
+def test_a_subject_links_to_the_latest_artifact(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for key in ("first", "second"):
         store.link_latest("ada", store.get_or_compute("fit", key, write_abc))
@@ -348,8 +348,8 @@ def test_view_points_at_the_latest(tmp_path: Path) -> None:
     assert list(link.parent.iterdir()) == [link]
 
 
-def test_two_with_one_process_number_link_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are in containers that share a store."""
+def test_two_processes_with_one_id_can_link_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in two containers that share a store."""
 
     def replaced(*ends: Path) -> None:
         monkeypatch.setattr(os, "replace", replace)
@@ -363,7 +363,7 @@ def test_two_with_one_process_number_link_at_once(tmp_path: Path, monkeypatch: p
     assert os.readlink(tmp_path / "subjects" / "ada" / "fit") == "../../fit/mine"
 
 
-def test_hands_of_another_recording_replace_those_before(tmp_path: Path) -> None:
+def test_new_hands_replace_the_old_ones_and_later_results(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("hands", "fit"):
         store.link_latest("ada", store.get_or_compute(stage, "old", write_abc))
@@ -371,24 +371,24 @@ def test_hands_of_another_recording_replace_those_before(tmp_path: Path) -> None
     assert [path.name for path in (tmp_path / "subjects" / "ada").iterdir()] == ["hands"]
 
 
-def test_what_was_made_without_hands_goes_when_there_are_some(tmp_path: Path) -> None:
+def test_new_hands_unlink_results_computed_without_them(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("capture", "fit", "asset", "hands"):
         store.link_latest("ada", store.get_or_compute(stage, "k", write_abc))
     assert sorted(path.name for path in (tmp_path / "subjects" / "ada").iterdir()) == ["capture", "hands"]
 
 
-def test_view_never_mixes_what_was_made_from_other_things(tmp_path: Path) -> None:
+def test_a_new_artifact_unlinks_results_computed_from_the_old_one(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("fit", "training", "asset"):
         store.link_latest("ada", store.get_or_compute(stage, "old", write_abc))
-    store.link_latest("ada", store.get_or_compute("training", "old", write_abc))  # the same again
+    store.link_latest("ada", store.get_or_compute("training", "old", write_abc))  # the same artifact again
     assert {path.name for path in (tmp_path / "subjects" / "ada").iterdir()} == {"fit", "training", "asset"}
     store.link_latest("ada", store.get_or_compute("fit", "new", write_abc))
     assert [path.name for path in (tmp_path / "subjects" / "ada").iterdir()] == ["fit"]
 
 
-def test_view_forgets_stages_that_a_run_did_without(tmp_path: Path) -> None:
+def test_stages_that_a_run_skipped_are_unlinked_with_later_results(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("capture", "hands", "fit"):
         store.link_latest("ada", store.get_or_compute(stage, "k", write_abc))
@@ -399,7 +399,7 @@ def test_view_forgets_stages_that_a_run_did_without(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "..", "../../home", "a/b"])
-def test_view_stays_within_the_store(tmp_path: Path, name: str) -> None:
+def test_subject_names_that_lead_out_of_the_store_are_refused(tmp_path: Path, name: str) -> None:
     store = Store(tmp_path)
     artifact = store.get_or_compute("fit", "k", write_abc)
     with pytest.raises(InputError, match=r"capture\.toml: name"):
@@ -415,12 +415,12 @@ def test_a_subject_whose_artifact_was_damaged_is_refused(tmp_path: Path) -> None
         require_intact(tmp_path / "subjects" / "ada")
 
 
-def test_a_subject_that_was_copied_out_of_its_store_is_not_known_to_be_damaged(tmp_path: Path) -> None:
+def test_a_subject_copied_out_of_its_store_is_accepted(tmp_path: Path) -> None:
     (tmp_path / "ada" / "fit").mkdir(parents=True)
     require_intact(tmp_path / "ada")
 
 
-def test_the_digest_of_the_recording_is_that_of_the_last_stage_that_read_it(tmp_path: Path) -> None:
+def test_the_digest_of_the_recording_is_that_of_its_last_stage(tmp_path: Path) -> None:
     store, folder = Store(tmp_path), tmp_path / "subjects" / "ada"
     assert recording_digest(folder) == ""
     for stage in ("capture", "hands"):

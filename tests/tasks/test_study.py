@@ -1,4 +1,4 @@
-"""Stages of studies through a store, on a small synthetic capture."""
+"""The stages of studies with a store, on a small synthetic capture."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def recording(store: Store) -> Artifact:
 
 
 def body(store: Store) -> Artifact:
-    """Return the unit box in frames 2 and 4."""
+    """Return a body fit of the unit box in frames 2 and 4."""
 
     def write(out: Path) -> dict[str, float]:
         BodyFit(box_rig(), (2, 4), torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1)).save(out)
@@ -40,7 +40,7 @@ def body(store: Store) -> Artifact:
     return store.get_or_compute("fit", "ada", write)
 
 
-def test_what_is_chosen_is_part_of_a_subsets_key(store: Store) -> None:
+def test_the_selection_is_part_of_the_key_of_a_subset(store: Store) -> None:
     few = subset_capture(store, recording(store), ("01",), (2, 4), None)
     assert few.metrics == {"cameras": 2, "frames": 4}
     again = subset_capture(store, recording(store), ("01",), (2, 4), None)
@@ -50,7 +50,7 @@ def test_what_is_chosen_is_part_of_a_subsets_key(store: Store) -> None:
     assert len({few.root, other.root, fewer.root}) == 3
 
 
-def test_strength_and_seed_are_part_of_a_degradations_key(store: Store) -> None:
+def test_strength_and_seed_are_part_of_the_key_of_a_degradation(store: Store) -> None:
     made = [
         degrade_capture(store, recording(store), Degradation(kind="image_noise", strength=strength, seed=seed))
         for strength, seed in ((5, 0), (5, 0), (6, 0), (5, 1))
@@ -60,7 +60,7 @@ def test_strength_and_seed_are_part_of_a_degradations_key(store: Store) -> None:
     assert Capture.load(made[0].root).train_cameras == ("01", "02")
 
 
-def test_what_is_worn_is_kept_only_with_the_ground_truth_of_its_key(
+def test_a_clothed_capture_is_stored_only_if_the_ground_truth_is_unchanged(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "calibrated_capture", lambda recording, _: Capture.load(recording.root))
@@ -75,14 +75,14 @@ def test_what_is_worn_is_kept_only_with_the_ground_truth_of_its_key(
     module.degrade_clothing(store, read_capture(tmp_path / "ada")[1], good, good, body(store), worn)
 
 
-def test_a_degraded_fit_is_a_fit_with_the_good_ones_report(store: Store) -> None:
+def test_a_degraded_fit_has_the_report_of_the_original_fit(store: Store) -> None:
     bad = degrade_fit(store, body(store), Degradation(kind="wrong_shape", strength=20, seed=0))
     assert set(bad.files) == set(body(store).files) == {"body.npz", "rig.npz", "report.json"}
     assert not torch.equal(BodyFit.load(bad.root).rig.vertices_m, box_rig().vertices_m)
 
 
-def test_a_surface_that_touches_itself_stays_closed(store: Store) -> None:
-    """Check two boxes with coincident edges, each with vertices of its own."""
+def test_a_surface_that_touches_itself_counts_as_closed(store: Store) -> None:
+    """Two boxes touch at an edge; each has its own vertices there."""
 
     def write(out: Path) -> dict[str, float]:
         (out / "meshes").mkdir()
@@ -97,7 +97,7 @@ def test_a_surface_that_touches_itself_stays_closed(store: Store) -> None:
     assert (found["volume"], found["length"]) == pytest.approx((1.01, 1.1), rel=1e-4)
 
 
-def test_meshes_are_judged_by_the_body_of_their_frame(store: Store) -> None:
+def test_meshes_are_compared_with_the_body_of_their_frame(store: Store) -> None:
     def write(out: Path) -> dict[str, float]:
         (out / "meshes").mkdir()
         for frame, side_m in ((2, 1.0), (4, 0.5)):

@@ -1,4 +1,4 @@
-"""The artifact of a training, with fake ranks."""
+"""The training stage, with fake ranks."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from tasks import training as module
 from tasks.store import Artifact, Store
 
 
-def test_the_checkpoint_is_there_until_the_ranks_are_done_and_never_in_the_artifact(
+def test_the_checkpoint_is_kept_until_training_ends_and_is_not_in_the_artifact(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def ranks(*arguments: object) -> None:
@@ -27,7 +27,7 @@ def test_the_checkpoint_is_there_until_the_ranks_are_done_and_never_in_the_artif
     given = Artifact(stage="capture", root=tmp_path, files={})
     with pytest.raises(OSError, match="lost"):
         module.train(Store(tmp_path), given, given, given, given, TrainingSettings())
-    with monkeypatch.context() as one_gpu:  # whoever asks for two loses nothing
+    with monkeypatch.context() as one_gpu:  # an impossible request keeps the checkpoint
         one_gpu.setattr("torch.cuda.device_count", lambda: 1)
         with pytest.raises(
             InputError, match=r"^training\.processes=2: each process needs a GPU, and this machine has 1;"

@@ -17,15 +17,15 @@ def store(tmp_path: Path) -> Store:
     return store
 
 
-def test_a_sound_store_has_no_faults(store: Store) -> None:
+def test_an_intact_store_has_no_faults(store: Store) -> None:
     everything, of_ada = faults(store), faults(store, ["ada"])
     assert everything.lines == of_ada.lines == []
     assert (everything.artifacts, of_ada.artifacts) == (12, 6)
-    assert everything.files == 12 + 2  # letters of each, and a capture.json of each person
+    assert everything.files == 12 + 2  # letters in each artifact, and a capture.json per person
     assert of_ada.size_bytes == 6 * len("abc 10") + len('{"name": "ada"}')
 
 
-def test_what_is_damaged_missing_or_not_of_it_is_named(store: Store) -> None:
+def test_damaged_missing_and_foreign_files_are_reported(store: Store) -> None:
     letters = sorted(store.root.glob("fit/*/deep/letters"))
     letters[0].write_text("abd")
     (letters[1].parent / "more").touch()
@@ -40,6 +40,6 @@ def test_what_is_damaged_missing_or_not_of_it_is_named(store: Store) -> None:
     ]  # fmt: skip
 
 
-def test_a_subject_that_is_not_there_is_refused(store: Store) -> None:
+def test_an_unknown_subject_is_refused(store: Store) -> None:
     with pytest.raises(InputError, match="no such subject"):
         faults(store, ["eve"])
