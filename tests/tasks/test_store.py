@@ -118,8 +118,8 @@ def test_a_resumable_stage_continues_from_its_partial_folder(tmp_path: Path) -> 
 def test_finished_work_that_could_not_be_recorded_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: int
 ) -> None:
-    """The disk is full, or the process is killed, before one of three renames: of the note of the use, of the record, or
-    of the folder."""
+    """The disk is full, or the process is killed, before one of three renames: that of the note of the use, that of the
+    record, or that of the folder."""
 
     def work(out: Path) -> dict[str, float]:
         resumed = (out / "checkpoint.pt").exists()

@@ -1,4 +1,4 @@
-"""First step of a training with any number of processes."""
+"""The first step of a training, with any number of processes."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def untrained(folder: Path, kind: str, processes: Distributed, memory_gib: float
 
 
 def gradients(trainer: Trainer, module: torch.nn.Module) -> dict[str, Tensor]:
-    """Return the gradients of one step by parameter."""
+    """Return the gradients of one step, by name of the parameter."""
     trainer._optimise(module)
     return {name: q.grad.clone() for name, q in trainer.objective.named_parameters() if q.grad is not None}
 
@@ -34,7 +34,7 @@ KINDS = ("fast", "paper")
 
 
 def write_first_step(folder: Path, kind: str, parts: int, processes: Distributed) -> None:
-    """Write the gradients of a step, and how many steps each rank skips where one rank's loss is not finite."""
+    """Write the gradients of a step, and how many steps each rank skips if one rank's loss is not finite."""
     trainer = untrained(folder, kind, processes)
     trainer.parts = Parts(parts, False, 1e9)
     module = DistributedDataParallel(trainer.objective, find_unused_parameters=True)
@@ -45,5 +45,5 @@ def write_first_step(folder: Path, kind: str, parts: int, processes: Distributed
     forward, odd = trainer.objective.forward, torch.tensor(float("nan") if processes.rank else 0.0)
     trainer.objective.forward = lambda *batch: forward(*batch) | {"odd": odd}  # type: ignore[method-assign]
     finite = gradients(trainer, module)
-    assert all(gradient.isfinite().all() for gradient in finite.values())  # so that they tell nothing
+    assert all(gradient.isfinite().all() for gradient in finite.values())  # so they do not reveal it
     (folder / f"skipped{processes.rank}").write_text(str(trainer.skipped))

@@ -1,5 +1,5 @@
-"""A simulated GPU: CPU tensors that claim to be on cuda:0, so that a machine without a GPU detects where tensors of two
-devices meet. Warp's kernels and `embedding_bag` run on the CPU."""
+"""A simulated GPU: CPU tensors that claim to be on cuda:0, so that tests without a GPU detect operations on tensors of
+two devices. Warp's kernels and `embedding_bag` run on the CPU."""
 
 import builtins
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ INDEXING = ("aten.index.", "aten.index_put", "aten._index_put")
 
 
 class OnCuda(Tensor):
-    """Wrapper of a CPU tensor; every operation that reaches a kernel checks devices as CUDA would."""
+    """A wrapped CPU tensor; every operation that reaches a kernel checks devices as CUDA would."""
 
     inner: Tensor
 
@@ -65,7 +65,7 @@ class OnCuda(Tensor):
 
 
 class Routed(TorchFunctionMode):
-    """Mode that redirects what is requested on CUDA to the CPU and wraps it."""
+    """A mode that runs CUDA requests on the CPU and wraps the results."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs, name = dict(kwargs or {}), getattr(func, "__name__", "")
@@ -80,7 +80,7 @@ class Routed(TorchFunctionMode):
                 target.detach().inner[tree_map(_unwrapped, where)] = _unwrapped(value)
                 return None
             assert not any(isinstance(x, OnCuda) for x in tree_leaves(args)), "CUDA is written into the CPU"
-        if name == "where" and len(args) == 3:  # numbers become tensors of the branches' kind
+        if name == "where" and len(args) == 3:  # numbers become tensors with the dtype of the branches
             kinds = [x.dtype for x in args[1:] if isinstance(x, Tensor)] or [torch.float32]
             args = (args[0], *(x if isinstance(x, Tensor) else torch.tensor(x, dtype=kinds[0]) for x in args[1:]))
         if _is_cuda(kwargs.get("device")):
@@ -89,7 +89,7 @@ class Routed(TorchFunctionMode):
 
 
 class OfCuda(torch.Generator):
-    """Generator that claims to be on CUDA."""
+    """A generator that claims to be on CUDA."""
 
     device = CUDA
 
@@ -119,7 +119,7 @@ class Meshes:
 
 @contextmanager
 def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
-    """Provide the simulated device; trained models are written and read, checkpoints are not."""
+    """Yield the simulated device. Trained models are written and read; checkpoints are not written."""
     bag, load = torch.nn.functional.embedding_bag, model.load_file
 
     def embedding_bag(corners: Tensor, values: Tensor, *, per_sample_weights: Tensor, mode: str, **_: Any) -> Tensor:
@@ -144,8 +144,8 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
         monkeypatch.setattr(module, "BodyMeshes", Meshes)
     for module in (correction_pull, shell, sparse_grids):
         monkeypatch.setattr(module, "_launch", _on_one_device(module._launch))
-    monkeypatch.setattr(shell, "ThreadPoolExecutor", lambda threads: nullcontext(builtins))  # modes are a thread's own
-    monkeypatch.setattr(PaperField, "compile_networks", lambda field: None)  # there is nothing to compile for
+    monkeypatch.setattr(shell, "ThreadPoolExecutor", lambda threads: nullcontext(builtins))  # modes are per thread
+    monkeypatch.setattr(PaperField, "compile_networks", lambda field: None)  # no GPU to compile for
     monkeypatch.setattr(model, "load_file", load_file)
     monkeypatch.setattr(trainer, "save_checkpoint", lambda folder, state: None)
     with Routed():
@@ -153,7 +153,7 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
 
 
 def _on_one_device(launch: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that runs warp's kernels on tensors of one device, on the CPU."""
+    """Return a function that launches warp's kernels on the CPU, after a check that all tensors are on one device."""
 
     def run(*args: Any) -> None:
         tensors = [x for x in tree_leaves(args) if isinstance(x, Tensor)]
@@ -195,7 +195,7 @@ def _is_cuda(device: Any) -> bool:
 
 
 def _on_cpu(x: Any) -> bool:
-    """Return whether x is a CPU tensor that may not meet CUDA tensors; one without dimensions may meet any device."""
+    """Return whether x is a CPU tensor that cannot be combined with CUDA tensors, as a 0-dimensional one can."""
     return isinstance(x, Tensor) and not isinstance(x, OnCuda) and not x.is_meta and x.dim() > 0
 
 

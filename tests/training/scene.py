@@ -1,5 +1,5 @@
-"""A recording small enough to train on in seconds: a bending red column before a grey plate, four cameras, 32
-pixels."""
+"""A recording small enough to train on in seconds: a bending red column in front of a grey plate, four cameras, images
+of 32 x 32 pixels."""
 
 from pathlib import Path
 from types import ModuleType
@@ -53,8 +53,8 @@ TINY = TrainingSettings.model_validate(
     }
 )
 
-# For trainings of a dozen steps. They leave no surface worth judging, so few rays are rendered for the check and the
-# held-out PSNR; the shell is tightened in coarse steps; and the memory of a ray is told from small batches.
+# For trainings of a dozen steps. Their surface is not worth checking, so few rays are rendered for the check and the
+# held-out PSNR; the shell is tightened in coarse steps; and the memory per ray is measured on small batches.
 SHRUNK_CONSTANTS: tuple[tuple[ModuleType, str, float], ...] = (
     (fixed_rays, "MIN_PERSON_COVERAGE", 0.0),
     (fixed_rays, "RAYS", 64),
@@ -65,18 +65,18 @@ SHRUNK_CONSTANTS: tuple[tuple[ModuleType, str, float], ...] = (
 
 
 def tiny(kind: str = "fast", **changes: object) -> TrainingSettings:
-    """Return the smallest settings of a kind of field, with changes."""
+    """Return minimal settings for a kind of field, with changes."""
     return TrainingSettings.model_validate(TINY.model_dump() | {"field": TINY_FIELDS[kind]} | changes)
 
 
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
-    """Return a camera at `centre_m` with `target_m` in the image centre, z up."""
+    """Return a camera at `centre_m` that sees `target_m` in the image centre, z up."""
     like = Camera(name, np.diag([1.2 * SIZE_PX, 1.2 * SIZE_PX, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
     return trajectory.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
 
 
 def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tuple[Capture, Masks, BodyFit]:
-    """Write the recording to `folder`, bent by the given angle in each frame; frame 2 is a novel pose."""
+    """Write the recording to `folder`, with the column bent by these angles in its frames; frame 2 is a novel pose."""
     rig = box_rig(bend_segments=6, splits=4)
     theta = torch.zeros(len(FRAMES), 2, 3)
     theta[:, 1, 1] = torch.tensor(bends_rad)

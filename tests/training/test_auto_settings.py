@@ -1,4 +1,4 @@
-"""Automatic settings by hand, and the measurement of a scene."""
+"""Automatic settings, compared with values computed by hand, and the measurement of a scene."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,10 +30,11 @@ def decided(scene: SceneStatistics, **given: object) -> tuple[TrainingSettings, 
     return decide(scene, settings)
 
 
-def test_sizes_by_hand():
-    """Pixels of 2 cm give 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 64 for geometry, in steps of 2 from 16.
-    Masks reach 3.5 cm out and 0.5 cm in, with a margin of 1.5 cm: 5 cm, and the minimum of 3 cm; 2.4 x 8 cm / 6 mm = 32
-    samples. Four million pixels at 2500 per step, each drawn one and a half times: 2400 steps."""
+def test_settings_equal_values_computed_by_hand():
+    """Pixels of 2 cm give 96 cells on 1.92 m, in levels from 24 by factors of 4 ** (1 / 3); for geometry 64, in levels
+    from 16 by factors of 2. Masks reach 3.5 cm out and 0.5 cm in. With a margin of 1.5 cm, the shell is 5 cm, and the
+    minimum of 3 cm; 2.4 x 8 cm / 6 mm = 32 samples. Four million pixels at 2500 per step, each drawn 1.5 times: 2400
+    steps."""
     settings, decisions = decided(SCENE)
     fast = settings.field
     assert fast.colour_cells == (24, 38, 60, 96)
@@ -43,16 +44,16 @@ def test_sizes_by_hand():
     assert decisions["field.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
 
 
-def test_no_finer_than_frames_align():
-    """Pixels of 1 mm would give 1920 cells; frames align to 1 cm."""
+def test_cells_are_no_finer_than_the_alignment_of_frames():
+    """Pixels of 1 mm would give 1920 cells, but frames align only to 1 cm."""
     fast = decided(replace(SCENE, footprint_m=0.001))[0].field
     assert fast.colour_cells[-1] == 192
     assert fast.geometry_cells[-1] == 128
 
 
 @pytest.mark.parametrize("nearly_static", [{"frames": 1}, {"std_rad": 0.001}])
-def test_one_posture_is_as_fine_as_its_pixels(nearly_static: dict):
-    """Cells shrink to 8 mm: 240 on 1.92 m, 160 for geometry, a sample per 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
+def test_with_one_posture_cells_are_as_fine_as_pixels(nearly_static: dict):
+    """Cells shrink to 8 mm: 240 on 1.92 m, 160 for geometry. With a sample per 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
     for footprint_m in (0.008, 0.001):
         settings, decisions = decided(replace(SCENE, footprint_m=footprint_m, **nearly_static))
         assert (settings.field.colour_cells[-1], settings.field.geometry_cells[-1]) == (240, 160)
@@ -60,31 +61,31 @@ def test_one_posture_is_as_fine_as_its_pixels(nearly_static: dict):
         assert "there is one posture: cells of 8.0 mm" in decisions["field.colour_cells"].reason
 
 
-def test_geometry_follows_the_colours_cells_that_are_given():
+def test_geometry_cells_follow_from_given_colour_cells():
     """128 / 1.5 = 85, whatever the pixel size."""
     assert decided(SCENE, field={"kind": "fast", "colour_cells": [24, 128]})[0].field.geometry_cells[-1] == 85
 
 
-def test_what_is_given_stands():
+def test_given_settings_are_kept():
     settings, decisions = decided(SCENE, steps=7, field={"kind": "fast", "samples": 5, "outer_m": 0.2})
     assert (settings.steps, settings.field.samples, settings.field.outer_m) == (7, 5, 0.2)
     open_ones = ("inner_m", "colour_cells", "geometry_cells", "pose_width", "nodes")
     assert set(decisions) == {*(f"field.{name}" for name in open_ones), "one_posture", "ground"}
 
 
-def test_samples_follow_a_shell_that_is_given():
+def test_samples_follow_from_a_given_shell():
     """2.4 x (20 + 5) cm / 6 mm = 100."""
     assert decided(SCENE, field={"kind": "fast", "outer_m": 0.2, "inner_m": 0.05})[0].field.samples == 100
 
 
-def test_a_shell_is_no_thicker_than_fifteen_centimetres():
-    """A skirt reaches 30 cm out of the body: 2.4 x (15 + 3) cm / 6 mm = 72."""
+def test_a_shell_is_at_most_fifteen_centimetres_thick():
+    """A skirt reaches 30 cm out from the body: 2.4 x (15 + 3) cm / 6 mm = 72."""
     fast = decided(replace(SCENE, outside_m=0.3))[0].field
     assert (fast.outer_m, fast.inner_m, fast.samples) == (0.15, 0.03, 72)
 
 
 def test_a_person_far_away_has_one_level():
-    """Pixels of 10 cm: 19 cells on 1.92 m, fewer than the 24 of a coarsest level, and 13 of geometry, than 16."""
+    """Pixels of 10 cm give 19 cells on 1.92 m, and 13 for geometry: fewer than the coarsest levels, 24 and 16."""
     fast = decided(replace(SCENE, footprint_m=0.1))[0].field
     assert (fast.colour_cells, fast.geometry_cells) == ((19,), (13,))
 
@@ -92,7 +93,7 @@ def test_a_person_far_away_has_one_level():
 @pytest.mark.parametrize(
     ("kind", "std_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
 )
-def test_frames_that_were_fitted_with_one_posture_keep_one(kind: str, std_rad: float, one: bool):
+def test_frames_fitted_with_one_posture_keep_one(kind: str, std_rad: float, one: bool):
     """The published method gives each frame its own posture; a given setting is kept."""
     scene = replace(SCENE, std_rad=std_rad)
     assert decided(scene, field={"kind": kind})[0].one_posture is one
@@ -100,7 +101,7 @@ def test_frames_that_were_fitted_with_one_posture_keep_one(kind: str, std_rad: f
 
 
 @pytest.mark.parametrize(("person_px", "steps"), [(1000, 600), (10**9, 4000)])
-def test_steps_have_bounds(person_px: int, steps: int):
+def test_steps_are_limited(person_px: int, steps: int):
     assert decided(replace(SCENE, person_px=person_px))[0].steps == steps
 
 
@@ -108,7 +109,7 @@ def test_steps_have_bounds(person_px: int, steps: int):
     ("cameras", "frames", "rate", "steps"),
     [(1, 40, 5e-4, 2160), (4, 40, 5e-4, 600), (1, 1, 5e-4, 600), (1, 40, 0, 600)],
 )
-def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frames: int, rate: float, steps: int):
+def test_one_camera_gets_more_steps_to_find_the_depth_of_bodies(cameras: int, frames: int, rate: float, steps: int):
     """540 steps per frame for 40 frames at 10 frames per step are 2160; one frame or given poses need no depth
     search."""
     scene = replace(SCENE, cameras=cameras, frames=frames, person_px=1000)
@@ -117,7 +118,7 @@ def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frame
     assert ("depths of 40 bodies" in decisions["steps"].reason) == (steps == 2160)
 
 
-def test_one_pose_teaches_nothing_about_poses():
+def test_with_nearly_one_pose_the_pose_network_is_minimal():
     settings, decisions = decided(replace(SCENE, std_rad=0.01))
     assert settings.field.pose_width == 1
     assert decisions["field.pose_width"].reason.endswith("too little to learn from")
@@ -141,16 +142,16 @@ def test_a_single_frame_or_camera_does_not_deform_the_body(cameras: int, frames:
         ((0, -0.06), False),
     ],
 )
-def test_the_ground_is_where_feet_stand_if_nobody_stands_lower(lowest_m: tuple[float, float], ground: bool):
+def test_the_ground_is_used_only_if_feet_stand_on_it_and_not_below(lowest_m: tuple[float, float], ground: bool):
     scene = replace(SCENE, lowest_m=lowest_m)
     assert decided(scene)[0].ground is ground
     assert decided(scene, ground=not ground)[0].ground is not ground
 
 
-def test_a_scene_as_it_is_measured(tmp_path: Path):
+def test_measured_statistics_of_a_scene(tmp_path: Path):
     """Cameras at 4.03 m with a focal length of 38.4 px: 0.105 m per pixel. The masks are the body's own silhouettes,
-    whose outline is its outermost pixels: half a pixel to one and a half inside. One of two joints is free and bends by
-    0 and 0.2 rad in the two training frames: 0.1 from their mean."""
+    whose outermost pixels are the outline: 0.5 to 1.5 pixels inside. One of two joints is free and bends by 0 and 0.2
+    rad in the two training frames: a standard deviation of 0.1 rad."""
     capture, masks, body = record(tmp_path / "capture")
     scene = SceneStatistics.of(capture, masks, body)
     assert (scene.cameras, scene.frames) == (4, 2)
@@ -164,9 +165,9 @@ def test_a_scene_as_it_is_measured(tmp_path: Path):
     assert scene.person_px == pytest.approx(np.sum(areas), rel=0.01)
 
 
-def test_a_camera_counts_by_the_masks_that_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """One mask a camera is measured. Camera 0 has one of 32 x 32 pixels, the others have two of 10 x 10 each: 1024 + 3
-    x 2 x 100. Camera 3 then loses its own."""
+def test_person_pixels_count_all_masks_of_a_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One mask per camera is measured. Camera 0 has one of 32 x 32 pixels, each other camera two of 10 x 10: 1024 + 3 x
+    2 x 100. Then the masks of camera 3 are removed."""
     monkeypatch.setattr(auto_settings, "MASKS_PER_CAMERA", 1)
     capture, _, body = record(tmp_path)
     whole, part = np.ones((SIZE_PX, SIZE_PX), bool), np.zeros((SIZE_PX, SIZE_PX), bool)
@@ -177,8 +178,9 @@ def test_a_camera_counts_by_the_masks_that_it_has(tmp_path: Path, monkeypatch: p
     assert SceneStatistics.of(capture, Masks(masks, {}), body).person_px == 1424
 
 
-def test_shells_hold_99_of_100_outline_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Outlines lie 50 pixels in to 50 pixels out: the 99th percentile of -50, -49, ... 50 is 49, the first is -49."""
+def test_shells_contain_99_percent_of_outline_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Outline points lie from 50 pixels inside to 50 outside: percentile 99 of -50, -49, ... 50 is 49, percentile 1 is
+    -49."""
     monkeypatch.setattr(auto_settings, "_outline_distance_px", lambda mask, covered: np.arange(-50.0, 51.0))
     monkeypatch.setattr(auto_settings, "MASKS_PER_CAMERA", 1)
     capture, masks, body = record(tmp_path)

@@ -1,4 +1,4 @@
-"""Collapse: a surface that is empty or fills the box ends training with an error, at the thresholds that users have."""
+"""Collapse: a surface that is empty or fills the box ends training with an error, at the real thresholds."""
 
 import dataclasses
 from pathlib import Path
@@ -21,20 +21,20 @@ FAR = 10.0  # units of the residual's last layer: metres away in either field
 
 
 @pytest.fixture(autouse=True)
-def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A few rays tell empty from full, whatever the steps in which the shell is tightened."""
+def few_rays_and_coarse_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Use few rays, which suffice to tell empty from full, and coarse steps to tighten the shell."""
     monkeypatch.setattr(fixed_rays, "RAYS", 128)
     monkeypatch.setattr(fast, "TIGHTEN_STEP_M", 0.02)
 
 
 def trainer_of(folder: Path, kind: str) -> Trainer:
-    """Return a trainer that takes two steps."""
+    """Return a trainer for two steps."""
     settings = tiny(kind, steps=2, novel_pose_steps=0)
     return Trainer(*record(folder / "capture"), settings, folder, ALONE)
 
 
 def move_surface(field: Field, outwards: float) -> None:
-    """Add an offset to the distance that the field's network adds to the body's."""
+    """Move the surface outwards: subtract an offset from the distance residual that the field's network predicts."""
     assert isinstance(field, PaperField | FastField)
     last = field.residual.residual if isinstance(field, PaperField) else field.field.geometry[-1]
     assert isinstance(last, nn.Linear)
@@ -42,12 +42,12 @@ def move_surface(field: Field, outwards: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ["fast", "paper"])
-def test_the_body_itself_is_a_surface(tmp_path: Path, kind: str):
+def test_the_body_itself_is_accepted_as_a_surface(tmp_path: Path, kind: str):
     trainer_of(tmp_path, kind).run()
 
 
-def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Path):
-    """Two samples per ray, across 5 m, hardly ever fall into the column."""
+def test_a_surface_between_training_samples_is_not_a_collapse(tmp_path: Path):
+    """With two samples per ray across 5 m, hardly any falls into the column."""
     trainer = trainer_of(tmp_path, "paper")
     trainer.field.samples = 2
     rays, samples = trainer.fixed_rays.sample(trainer.scene, trainer.train_rows, 2)
@@ -70,8 +70,8 @@ def test_a_collapsed_surface_is_an_error(tmp_path: Path, kind: str, outwards: fl
         trainer.run()
 
 
-def test_a_single_pixel_away_from_outlines_does_not_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its mask may lack what the field shows; here it is labelled as beside the person, and all others as outline."""
+def test_a_single_pixel_away_from_outlines_does_not_decide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The mask may be wrong there. Here one pixel is labelled as outside the person, and all others as outline."""
     trainer = trainer_of(tmp_path, "fast")
     sample = trainer.fixed_rays.sample
 
@@ -86,7 +86,7 @@ def test_a_single_pixel_away_from_outlines_does_not_tell(tmp_path: Path, monkeyp
     trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
 
 
-def test_a_distance_that_is_not_a_number_is_no_surface(tmp_path: Path):
+def test_a_nan_distance_counts_as_an_empty_surface(tmp_path: Path):
     trainer = trainer_of(tmp_path, "fast")
     move_surface(trainer.field, float("nan"))
     with pytest.raises(TrainingError, match="surface is empty"):

@@ -1,5 +1,5 @@
-"""Devices: tensors of two devices never meet, from the body to an image; on a GPU if there is one, else on a simulated
-one."""
+"""Devices: no operation mixes tensors of two devices, from the body to an image. The tests use a GPU if there is one,
+and a simulated one otherwise."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -37,6 +37,6 @@ def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pyt
         shown = avatar.render(camera, theta, root)
         assert shown.rgb.device == device
         assert depth_image(shown, camera).shape == normal_image(avatar, shown, camera, theta, root).shape[:2]
-        if kind == "fast":  # others have no surface yet
+        if kind == "fast":  # the others have no surface yet
             assert surface_in_pose(avatar, theta, root, 32).is_watertight
         assert avatar.colour(avatar.body.rig.vertices_m, avatar.body.rig.vertices_m, theta, root).device == device

@@ -1,4 +1,4 @@
-"""Camera gains from what two cameras see of the same body points."""
+"""Camera gains from the colours of body points that two cameras see."""
 
 import dataclasses
 from pathlib import Path
@@ -50,22 +50,22 @@ def measured(gains: dict[str, tuple[float, float, float]], unmasked: str = "") -
     return camera_gains(capture, masks, body)
 
 
-def test_gains_by_hand() -> None:
-    """b is twice as bright as a and as c: about a mean of 2^(1/3), a and c at 1, b at 2. d shares nothing."""
+def test_gains_equal_values_computed_by_hand() -> None:
+    """b is twice as bright as a and c: relative to the mean of 2^(1/3), a and c are 1, b is 2. d shares no points."""
     twice = np.full((400, 3), np.log(2))
     logs = solve_gains(4, {(0, 1): twice, (1, 2): -twice})
     assert np.exp(logs[:, 0]) == pytest.approx([2 ** (-1 / 3), 2 ** (2 / 3), 2 ** (-1 / 3), 1])
 
 
-def test_the_larger_number_of_places_counts_more() -> None:
-    """Three cameras in a ring have ratios that contradict each other by log 0.3, which is shared as 1 / 300, 1 / 300
-    and 1 / 100."""
+def test_pairs_with_more_shared_points_have_more_weight() -> None:
+    """The log ratios of three cameras in a ring contradict each other by 0.3, which is distributed in proportions of
+    1 / 300, 1 / 300 and 1 / 100."""
     logs = solve_gains(3, {(0, 1): np.zeros((300, 3)), (1, 2): np.zeros((300, 3)), (0, 2): np.full((100, 3), 0.3)})
     assert logs[2, 0] - logs[0, 0] == pytest.approx(0.3 * (1 / 150) / (1 / 150 + 1 / 100))
 
 
-def test_a_few_places_that_differ_do_not_count() -> None:
-    """Two of five ratios are of another limb: the median of 0.1, 0.2, 0.3, 5 and 9 is 0.3."""
+def test_a_few_outlier_points_do_not_count() -> None:
+    """Two of five ratios come from another limb: the median of 0.1, 0.2, 0.3, 5 and 9 is 0.3."""
     found = np.repeat([[0.1], [9], [0.3], [5], [0.2]], 3, axis=1)
     np.testing.assert_allclose(solve_gains(2, {(0, 1): found})[:, 0], [-0.15, 0.15])
 
@@ -75,8 +75,8 @@ def test_cameras_that_share_too_little_are_not_compared(monkeypatch: pytest.Monk
     assert measured({"a": (0.5, 0.5, 0.5), "b": (1, 1, 1)})[1].reason == "no two cameras to compare"
 
 
-def test_levels_of_a_body_point_are_those_of_its_pixel_if_they_are_usable() -> None:
-    """Above row 48 one channel is 15, at and below row 80 one is 245; left of column 64 nobody is in the mask."""
+def test_colours_of_body_points_are_taken_from_usable_pixels() -> None:
+    """Above row 48 one channel is 15; from row 80 down one is 245; left of column 64 the mask is empty."""
     picture, mask = np.full((128, 128, 3), 100, np.uint8), np.ones((128, 128), bool)
     picture[:48, :, 0], picture[80:, :, 2] = 15, 245
     mask[:, :64] = False
@@ -99,39 +99,39 @@ def test_gains_of_cameras_that_see_the_same_ball() -> None:
     assert "differ from the usual exposure by 27%" in decision.reason  # red of a: (1.2 x 1.1 / 0.8^3)^(1/4) = 1.267
 
 
-def test_most_cameras_that_agree_stay_as_they_are() -> None:
-    """Other cameras, such as test cameras, are most likely exposed as the majority."""
+def test_a_majority_of_equal_cameras_has_gain_one() -> None:
+    """Other cameras, such as test cameras, most likely have the exposure of the majority."""
     found, decision = measured({"a": (1, 1, 1), "b": (1, 1, 1), "c": (1, 1, 1), "d": (1.5, 1.5, 1.5)})
     for name, gain in (("a", 1), ("b", 1), ("c", 1), ("d", 1.5)):
         assert found[name] == pytest.approx((gain,) * 3, rel=0.01)
     assert "differ from the usual exposure by 50%" in decision.reason
 
 
-def test_a_camera_that_nobody_compares_is_taken_for_a_usual_one() -> None:
+def test_a_camera_that_cannot_be_compared_has_gain_one() -> None:
     """a and b agree, c is brighter; d has no mask in the compared frame."""
     found, _ = measured({"a": (1, 1, 1), "b": (1, 1, 1), "c": (1.3, 1.3, 1.3), "d": (1, 1, 1)}, unmasked="d")
     assert [found[name][0] for name in "abcd"] == pytest.approx([1, 1, 1.3, 1], rel=0.01)
 
 
-def test_nothing_is_changed_where_shading_may_be_the_cause_or_nobody_compares() -> None:
+def test_small_differences_and_cameras_without_a_pair_are_not_corrected() -> None:
     assert measured({"a": (1, 1, 1), "b": (1.1, 1, 1), "c": (1, 1, 1), "d": (1, 1, 1)})[0] == {}
     assert measured({"a": (0.5, 0.5, 0.5), "c": (1, 1, 1)})[1].reason == "no two cameras to compare"  # back to back
     assert measured({"a": (0.5, 0.5, 0.5)})[0] == {}
 
 
-def test_what_is_hidden_is_not_in_sight() -> None:
+def test_hidden_and_grazing_vertices_are_not_visible() -> None:
     """A ball of a quarter of the size between camera a and the other ball hides its middle."""
     small = trimesh.creation.icosphere(subdivisions=4, radius=0.25).apply_translation([2, 0, 0])
     seen, _ = _visible_vertices(RING["a"], Surface(trimesh.util.concatenate([BALL, small])))
     places = BALL.vertices[seen[: len(BALL.vertices)]]
     assert len(places) > 100
-    assert (np.hypot(places[:, 1], places[:, 2]) / (4 - places[:, 0]) > 0.12).all()  # beside the small one's cone
+    assert (np.hypot(places[:, 1], places[:, 2]) / (4 - places[:, 0]) > 0.12).all()  # outside the small ball's cone
     assert seen[len(BALL.vertices) :].any()
     towards = (RING["a"].centre_m - places) / np.linalg.norm(RING["a"].centre_m - places, axis=1, keepdims=True)
-    assert 0.4 < (towards * places).sum(1).min() < 0.42  # what is seen at a flatter angle does not tell its colour
+    assert 0.4 < (towards * places).sum(1).min() < 0.42  # points seen at a flatter angle are not used
     turned = np.diag([-1.0, 1, -1])
     away = dataclasses.replace(RING["a"], R=turned @ RING["a"].R, t_m=turned @ RING["a"].t_m)
-    assert not _visible_vertices(away, Surface(BALL))[0].any()  # it is behind the camera
+    assert not _visible_vertices(away, Surface(BALL))[0].any()  # the ball is behind the camera
 
 
 def test_pixels_are_corrected_by_the_gains_of_their_cameras(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_pixels_are_corrected_by_the_gains_of_their_cameras(tmp_path: Path) -> N
     assert torch.equal(exposure_corrected.colour[~first], pixels.colour[~first])
 
 
-def test_a_training_camera_shows_what_its_gain_makes_of_it(tmp_path: Path) -> None:
+def test_rendering_a_training_camera_applies_its_gain(tmp_path: Path) -> None:
     capture, _, body = record(tmp_path)
     avatar = TrainedAvatar(build_field(TINY.field, body, False), body, 1.0, body, {"0": (0.5, 1.0, 2.0)})
     plain = TrainedAvatar(avatar.field, body, 1.0, body)

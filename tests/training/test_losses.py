@@ -1,4 +1,4 @@
-"""Each loss on two rays with two samples, by hand."""
+"""Each loss on two rays with two samples, compared with values computed by hand."""
 
 import math
 from dataclasses import replace
@@ -13,7 +13,7 @@ from hnerf.training.losses import Target
 
 RED, GREEN, BLACK = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]
 
-# Ray 0 on the person: red at half opacity, then green, opaque by the SDF. Ray 1 beside: transparent, black beyond.
+# Ray 0 hits the person: red at half opacity, then green, opaque in the SDF. Ray 1 misses: transparent, then black.
 SAMPLES = RaySamples(
     alpha=torch.tensor([[0.5, 0.5], [0.0, 0.2]]),
     alpha_dot=torch.tensor([[0.0, 1.0], [0.0, 0.0]]),
@@ -44,14 +44,14 @@ def test_mask():
     assert losses.mask(SAMPLES, TARGET).item() == pytest.approx(0.75 / 2)
 
 
-def test_mask_ignores_what_is_outside_the_box():
-    """Without its second sample the ray is (0.5, 0, 0): error 0.5."""
+def test_mask_ignores_samples_outside_the_box():
+    """Without its second sample, the colour of the ray is (0.5, 0, 0): error 0.5."""
     outside = replace(SAMPLES, in_box=torch.tensor([[1.0, 0.0], [1.0, 0.0]]))
     assert losses.mask(outside, TARGET).item() == pytest.approx(0.5 / 2)
 
 
 def test_fog():
-    """C~ of ray 1, which passes beside the person, is (0, 0.2, 0) in the box, black where its fog is outside."""
+    """Ray 1 misses the person. Its C~ is (0, 0.2, 0) with all samples in the box, and black if its fog is outside."""
     assert losses.fog(replace(SAMPLES, in_box=torch.ones(2, 2)), TARGET).item() == pytest.approx(0.2 / 2)
     assert losses.fog(SAMPLES, TARGET).item() == 0
     left_out = replace(TARGET, weight=torch.tensor([1.0, 0.0]))
@@ -59,7 +59,7 @@ def test_fog():
 
 
 def test_blend():
-    """C^ of ray 0 is green: error 2; of ray 1 (outside the box alpha stands) (0, 0.2, 0): 0.2 eta."""
+    """C^ of ray 0 is green: error 2. C^ of ray 1, which uses alpha outside the box, is (0, 0.2, 0): error 0.2 eta."""
     assert losses.blend(SAMPLES, TARGET, eta=0.25).item() == pytest.approx((2 + 0.25 * 0.2) / 2)
 
 
@@ -68,19 +68,19 @@ COUPLED = replace(SAMPLES, alpha_dot=torch.tensor([[0.2, 0.9], [0.1, 0.5]]))
 
 
 def cross_entropies(predicted: tuple[float, ...], labels: tuple[float, ...]) -> float:
-    """Return half the sum, which is the mean over two rays."""
+    """Return half the sum of binary cross-entropies, which is the mean over two rays."""
     both = zip(predicted, labels, strict=True)
     return sum(-p * math.log(q) - (1 - p) * math.log(1 - q) for q, p in both) / 2
 
 
-def test_geometry_in_the_roles_of_the_print():
-    """Densities are labels of the predictions 0.2, 0.9 and 0.1; what is outside the box is ignored."""
+def test_geometry_with_the_roles_in_the_published_formula():
+    """Densities are labels for the predictions 0.2, 0.9 and 0.1; samples outside the box are ignored."""
     expected = cross_entropies((0.2, 0.9, 0.1), LABELS)
     assert losses.geometry(COUPLED, 50.0, 0.1, "print").item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_geometry_where_the_surface_leads():
-    """Densities are predictions of the labels 0.2, 0.9 and 0.1, which get no gradient."""
+def test_geometry_with_the_surface_as_labels():
+    """Densities are predictions for the labels 0.2, 0.9 and 0.1, which get no gradient."""
     occupied, density = COUPLED.alpha_dot.clone().requires_grad_(), COUPLED.density.clone().requires_grad_()
     loss = losses.geometry(replace(COUPLED, alpha_dot=occupied, density=density), 50.0, 0.1, "surface_leads")
     assert loss.item() == pytest.approx(cross_entropies(LABELS, (0.2, 0.9, 0.1)), rel=1e-5)
@@ -90,29 +90,29 @@ def test_geometry_where_the_surface_leads():
 
 
 def test_geometry_of_certain_predictions_is_finite():
-    """Predictions 0, 1 and 0 are taken as 1e-6 from there: the labels cost 0.731, 0.5 and 0.0067 times 13.8."""
+    """Predictions of 0, 1 and 0 are clamped by 1e-6: the labels 0.731, 0.5 and 0.0067 each cost 13.8 times as much."""
     certain = sum(LABELS) * 6 * math.log(10) / 2
     assert losses.geometry(SAMPLES, 50.0, 0.1, "print").item() == pytest.approx(certain, rel=2e-3)
 
 
-def test_geometry_vanishes_where_the_sdf_is_the_density():
+def test_geometry_is_zero_if_the_sdf_is_the_density():
     assert losses.geometry(replace(SAMPLES, density=None), 50.0, 0.1, "print").item() == 0
 
 
-def test_not_a_number_passes_through_the_cross_entropy():
-    """The step is then skipped with its cause named, instead of an error of the library."""
+def test_cross_entropy_of_nan_is_nan():
+    """The step is then skipped with a stated cause, instead of an error from the library."""
     broken = torch.full_like(SAMPLES.d, torch.nan)
     assert losses.segmentation(broken, TARGET, 80.0).isnan()
 
 
 def test_segmentation():
-    """min d_hat: -0.02 on the person, 0.14 beside; gamma 80: -log sigmoid(1.6) - log(1 - sigmoid(-11.2))."""
+    """min d_hat is -0.02 on the person, 0.14 outside; with gamma 80: -log sigmoid(1.6) - log(1 - sigmoid(-11.2))."""
     expected = -math.log(1 / (1 + math.exp(-1.6))) - math.log(1 - 1 / (1 + math.exp(11.2)))
     assert losses.segmentation(SAMPLES.d_hat, TARGET, 80.0).item() == pytest.approx(expected / 2, rel=1e-3)
 
 
-def test_a_pixel_pulls_a_body_however_far():
-    """-log sigmoid(-80 x 0.3) is 24, of slope 80 a metre."""
+def test_a_distant_body_is_pulled_with_full_slope():
+    """-log sigmoid(-80 x 0.3) is 24, with a slope of 80 per metre."""
     far = torch.full((2, 1), 0.3, requires_grad=True)
     loss = losses.segmentation(far, replace(TARGET, person=torch.ones(2)), 80.0)
     loss.backward()
@@ -120,8 +120,8 @@ def test_a_pixel_pulls_a_body_however_far():
     assert far.grad.flatten().tolist() == pytest.approx([40.0, 40.0])
 
 
-def test_fit_takes_the_body_alone():
-    """min d = 0.01 on the person, outside the body: -log sigmoid(-0.8)."""
+def test_fit_uses_the_distance_to_the_body_only():
+    """min d = 0.01 on the person, that is outside the body: -log sigmoid(-0.8)."""
     expected = -math.log(1 / (1 + math.exp(0.8))) - math.log(1 - 1 / (1 + math.exp(8)))
     assert losses.segmentation(SAMPLES.d, TARGET, 80.0).item() == pytest.approx(expected / 2, rel=1e-4)
 
@@ -130,13 +130,13 @@ def test_eikonal():
     assert losses.eikonal(SAMPLES).item() == pytest.approx((0.25 + 0.04) / 2)
 
 
-def test_residual_punishes_only_what_goes_inside_the_skin():
+def test_residual_penalises_only_surfaces_inside_the_skin():
     """The only positive residual is 0.04."""
     assert losses.residual(SAMPLES).item() == pytest.approx(0.04 / 2)
 
 
 def test_increment():
-    """|dbeta| = 5; frames: |(3, 4)| = 5 and 0: mean 2.5."""
+    """|dbeta| = 5; in the two frames |(3, 4)| = 5 and 0: mean 2.5."""
     correction = PoseCorrection(frames=2, free_joints=0, shapes=2)
     with torch.no_grad():
         correction.shape.copy_(torch.tensor([3.0, 4.0]))
@@ -145,7 +145,8 @@ def test_increment():
 
 
 def test_floor():
-    """Below the ground are 2 and 3 cm of the first ray, whose third sample is outside; of the second nothing."""
+    """Below the ground, the first ray has samples 2 and 3 cm inside the body and one outside, the second none
+    inside."""
     d_hat = torch.tensor([[-0.02, -0.03, 0.5], [-0.04, 0.1, 0.2]], dtype=torch.float64, requires_grad=True)
     height_m = torch.tensor([[-0.01, -0.02, -0.03], [0.01, -0.01, 0.02]])
     assert losses.floor(d_hat, height_m).item() == pytest.approx(0.025)
@@ -159,7 +160,7 @@ def test_elastic():
 
 
 @pytest.mark.parametrize("name", ["reconstruction", "mask", "eikonal", "residual"])
-def test_gradients_in_double(name: str):
+def test_gradients_in_double_precision(name: str):
     def loss(alpha, residual, norms):
         samples = replace(double, alpha=alpha, residual=residual, gradient_norm=norms)
         return (
@@ -174,7 +175,7 @@ def test_gradients_in_double(name: str):
     assert torch.autograd.gradcheck(loss, inputs)
 
 
-def test_gradients_of_coupled_losses_in_double():
+def test_gradients_of_coupled_losses_in_double_precision():
     double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
     target = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
 
@@ -192,7 +193,7 @@ def test_gradients_of_coupled_losses_in_double():
     )
 
 
-def test_gradients_of_what_pulls_poses_and_deformations_back_in_double():
+def test_gradients_of_pose_and_deformation_losses_in_double_precision():
     correction = PoseCorrection(2, 1, 3).double()
     generator = torch.Generator().manual_seed(0)
     shapes = [p.shape for p in correction.parameters()]

@@ -1,4 +1,4 @@
-"""Gradient accumulation: parts of a batch have the gradients of the whole, and their number follows from the memory."""
+"""Gradient accumulation: the parts of a batch add up to the gradients of the whole; memory determines their number."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ CPU = torch.device("cpu")
 
 
 class Scale(nn.Module):
-    """Losses of a number w: the mean over rays of w x, and 3 w, whatever the rays."""
+    """Losses of a parameter w: the mean of w x over rays, and 3 w, which does not depend on rays."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -34,11 +34,12 @@ class Scale(nn.Module):
 @pytest.mark.parametrize(
     ("world_size", "count", "side_by_side"), [(1, 1, False), (1, 2, True), (1, 3, False), (2, 3, False)]
 )
-def test_parts_of_unequal_size_add_up_to_the_joint_batch(
+def test_parts_of_unequal_size_add_up_to_the_whole_batch(
     monkeypatch: pytest.MonkeyPatch, world_size: int, count: int, side_by_side: bool
 ) -> None:
-    """x of seven rays is 1 to 7, 4 in the mean: d/dw = 4 + 3. Three parts of 3, 2 and 2 rays have means of 2, 4.5 and
-    6.5, whose mean is 4.33; two processes of three parts have one of two rays and five of one."""
+    """x is 1 to 7 for seven rays, with a mean of 4: d/dw = 4 + 3. Three parts of 3, 2 and 2 rays have means of 2, 4.5
+    and 6.5, whose unweighted mean would be 4.33. Two processes with three parts each have one part of two rays and five
+    of one ray."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     x = torch.arange(1.0, 8, dtype=torch.float64)[:, None].expand(7, 3)
     rays = PixelRays(x, x, torch.zeros(7, dtype=torch.long), x, x[:, 0] > 0, x[:, 0] > 0, None)
@@ -51,21 +52,21 @@ def test_parts_of_unequal_size_add_up_to_the_joint_batch(
         means.append(terms["mean"].item())
         slopes.append(module.w.grad.item())
     assert sum(slopes) / world_size == pytest.approx(7, rel=1e-14)
-    assert sum(means) / world_size == pytest.approx(8, rel=1e-14)  # w 4
+    assert sum(means) / world_size == pytest.approx(8, rel=1e-14)  # 4 w
 
 
 def attempted(about: int) -> tuple[int, Tensor]:
-    """Return a loss of rays that saves 1024 doubles for each, and 1000 for all."""
+    """Return the ray count and a loss that saves 1024 doubles per ray, and 1000 in addition."""
     learned = torch.ones((), dtype=torch.float64, requires_grad=True)
     both = [learned * torch.ones(n, dtype=torch.float64) for n in (1024 * about, 1000)]
     return about, both[0].sum() + both[1].sum()
 
 
 @pytest.mark.parametrize(("rays", "world_size", "parts"), [(100, 1, 1), (101, 1, 2), (1000, 1, 10), (1000, 4, 3)])
-def test_parts_follow_from_the_memory_that_a_ray_needs(
+def test_the_number_of_parts_follows_from_the_memory_per_ray(
     monkeypatch: pytest.MonkeyPatch, rays: int, world_size: int, parts: int
 ) -> None:
-    """A ray needs 8 KiB, a batch 8000 bytes more; the memory, given or free, has room for 100 and a half rays."""
+    """A ray needs 8 KiB, a batch 8000 bytes more; the memory, given or free, has room for 100.5 rays."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     monkeypatch.setattr(Distributed, "all_max", lambda self, value: value)
     room = PEAK_FACTOR * (8000 + 8192 * 100.5)
@@ -78,8 +79,8 @@ def test_parts_follow_from_the_memory_that_a_ray_needs(
     assert decide_parts(rays, None, attempted, processes)[0].count == parts
 
 
-def test_what_fits_is_taken_in_halves_side_by_side_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two halves run side by side if there are threads; what does not fit runs one part after another."""
+def test_on_a_cpu_a_batch_that_fits_runs_as_two_parallel_halves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With two threads, two halves run in parallel; if that does not fit, parts run one after another."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     made, decision = decide_parts(100, 1.0, attempted, ALONE)
     assert made.count == decision.value == 2 and made.pool is not None
@@ -91,7 +92,7 @@ def test_what_fits_is_taken_in_halves_side_by_side_on_a_cpu(monkeypatch: pytest.
 def test_memory_changes_the_number_of_parts_and_not_the_gradients(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    """128 rays of 1 MB each in 50 MB: 43, 43 and 42. Evaluation during training is split likewise."""
+    """128 rays of 1 MB each in 50 MB: parts of 43, 43 and 42. Evaluation during training is split in the same way."""
     monkeypatch.setattr(fixed_rays, "RAYS", 300)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     monkeypatch.setattr(parts_module, "_peak_bytes", lambda trial_loss, about, device: (about, 1e6 * about))

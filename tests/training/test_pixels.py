@@ -1,4 +1,4 @@
-"""Which pixels a step draws, and where a recording's edges are."""
+"""The pixels that a step draws, where outlines are, and which pixels a body or box can reach."""
 
 import dataclasses
 import errno
@@ -20,12 +20,12 @@ from hnerf.training.plates import plates_of
 from tests.training.scene import ALONE, SIZE_PX, record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
-AFAR = dataclasses.replace(AHEAD, K=np.diag([5000.0, 5000.0, 1.0]))  # its rays are all but parallel
+AFAR = dataclasses.replace(AHEAD, K=np.diag([5000.0, 5000.0, 1.0]))  # its rays are almost parallel
 REACHED = functools.partial(within_reach, reach_m=0.2)
 
 
 def test_a_third_of_the_rays_is_drawn_at_edges():
-    """Two frames of four and two pixels; one frame has its first pixel at an edge, the other none."""
+    """Two frames with four and two pixels. The first frame has an edge at its first pixel, the second has none."""
     number = torch.arange(6)
     edge = torch.tensor([True] + [False] * 5)
     pixels = Pixels(
@@ -49,11 +49,11 @@ def test_a_third_of_the_rays_is_drawn_at_edges():
     assert drawn[0].unique().tolist() == [4, 5]
     assert drawn[1, :100].unique().tolist() == [0]
     assert drawn[1, 100:].unique().tolist() == [0, 1, 2, 3]
-    assert 30 < int((drawn[1, 100:] == 0).sum()) < 70  # a quarter of the others, by chance
+    assert 30 < int((drawn[1, 100:] == 0).sum()) < 70  # about a quarter of the remaining 200 rays
 
 
-def test_where_a_pixel_lies_follows_from_its_image() -> None:
-    """Images of 3 x 2, 2 x 2 and 3 x 2 pixels of cameras 0, 1 and 0, first whole, then only some pixels."""
+def test_camera_and_position_of_a_pixel_follow_from_its_index() -> None:
+    """Images of 3 x 2, 2 x 2 and 3 x 2 pixels from cameras 0, 1 and 0; first with all pixels, then with some."""
     none = torch.zeros(0)
     names = ("starts", "edges", "edge_starts", "colour", "plate", "person", "edge", "rays_from_px", "centres_m")
     like = dict.fromkeys(names, none)
@@ -62,7 +62,7 @@ def test_where_a_pixel_lies_follows_from_its_image() -> None:
     camera, xy_px = whole.cameras_and_xy(torch.tensor([0, 5, 6, 9, 10, 14]))
     assert camera.tolist() == [0, 0, 1, 1, 0, 0]
     assert xy_px.tolist() == [[0, 0], [2, 1], [0, 0], [1, 1], [0, 0], [1, 1]]
-    pixel_index = torch.tensor([0, 1, 2, 3, 4, 5, 2], dtype=torch.int32)  # the second image shows nothing of interest
+    pixel_index = torch.tensor([0, 1, 2, 3, 4, 5, 2], dtype=torch.int32)  # the second image has no pixels
     some = Pixels(image_starts=torch.tensor([0, 5, 5, 7]), pixel_index=pixel_index, **images, **like)
     camera, xy_px = some.cameras_and_xy(torch.tensor([4, 5, 6]))
     assert camera.tolist() == [0, 0, 0]
@@ -70,8 +70,8 @@ def test_where_a_pixel_lies_follows_from_its_image() -> None:
 
 
 @pytest.mark.parametrize("visible_pixels", [REACHED, None])
-def test_pixels_show_what_the_images_do(tmp_path: Path, visible_pixels: ReachablePixels | None) -> None:
-    """Without a visibility function, images are whole and have no plates."""
+def test_gathered_pixels_equal_those_of_the_images(tmp_path: Path, visible_pixels: ReachablePixels | None) -> None:
+    """Without a visibility function, all pixels are used, and there are no plates."""
     capture, masks, body = record(tmp_path)
     out = tmp_path / "out"
     out.mkdir()
@@ -91,7 +91,7 @@ def test_pixels_show_what_the_images_do(tmp_path: Path, visible_pixels: Reachabl
             assert pixels.edge[part].any()
 
 
-def test_pixels_that_have_no_room_leave_it_to_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gathering_that_fills_the_disk_leaves_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr(gather, "_exposure_corrected", Mock(side_effect=full))
     capture, masks, body = record(tmp_path)
@@ -100,7 +100,7 @@ def test_pixels_that_have_no_room_leave_it_to_others(tmp_path: Path, monkeypatch
     assert not any((tmp_path / "out").iterdir())
 
 
-def test_an_image_that_shows_nothing_of_the_person_has_no_pixels(tmp_path: Path) -> None:
+def test_an_image_that_the_body_does_not_reach_has_no_pixels(tmp_path: Path) -> None:
     capture, masks, body = record(tmp_path)
     masks.encoded["1", 0] = encode(np.zeros((SIZE_PX, SIZE_PX), bool))
 
@@ -113,9 +113,11 @@ def test_an_image_that_shows_nothing_of_the_person_has_no_pixels(tmp_path: Path)
     assert int(pixels.image_starts.diff()[1]) == 0 < int(pixels.image_starts.diff()[2])
 
 
-def test_an_outline_before_an_unknown_background_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one camera nothing is known: its outlines are gone, its other pixels and the other cameras' outlines are
-    not."""
+def test_outline_pixels_with_an_unknown_background_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The background of one camera is unknown: only its outline pixels are left out, not its other pixels nor those of
+    other cameras."""
     capture, masks, body = record(tmp_path)
     every = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
     plates = plates_of(capture, masks, body.frames) or []
@@ -127,8 +129,8 @@ def test_an_outline_before_an_unknown_background_is_left_out(tmp_path: Path, mon
     assert torch.equal(some.edges, torch.nonzero(some.edge)[:, 0])
 
 
-def test_edges_reach_two_pixels_in_and_out(tmp_path: Path):
-    """Around a square of 12 px: 16 x 16 px without 8 x 8."""
+def test_edges_extend_two_pixels_inwards_and_outwards(tmp_path: Path):
+    """Around a square of 12 x 12 px, edges are the 16 x 16 px without the inner 8 x 8."""
     capture, masks, body = record(tmp_path)
     square = np.zeros((SIZE_PX, SIZE_PX), bool)
     square[10:22, 10:22] = True
@@ -158,7 +160,7 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
 
 
 def test_a_body_inside_the_image_reaches_a_disc_around_each_vertex():
-    """A reach of 20 cm at 200 m with 5000 px focal length is 5 px."""
+    """A reach of 20 cm at 200 m with a focal length of 5000 px is 5 px."""
     xy = np.random.default_rng(0).integers([8, 8], [52, 32], (30, 2))
     visible_pixels = within_reach(AFAR, np.hstack([xy / 25, np.full((30, 1), 200.0)]), 0.2)
     y, x = np.mgrid[:40, :60]
@@ -167,7 +169,7 @@ def test_a_body_inside_the_image_reaches_a_disc_around_each_vertex():
 
 
 def test_a_body_beside_the_image_reaches_into_it():
-    """A vertex 3 px left of the image, in row 20, is a disc of 5 px: columns 0 to 2 of that row."""
+    """A vertex 3 px left of the image in row 20 reaches a disc of radius 5 px: columns 0 to 2 of that row."""
     visible_pixels = within_reach(AFAR, np.array([[-3 / 25, 20 / 25, 200.0]]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [0, 1, 2]
     assert visible_pixels.any(1).nonzero()[0].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 24]
@@ -175,27 +177,27 @@ def test_a_body_beside_the_image_reaches_into_it():
 
 @pytest.mark.parametrize("xy_px", [(-32, 20), (30, -32), (92, 20), (30, 72)])
 def test_a_body_far_beside_the_image_does_not_reach_it(xy_px: tuple[int, int]):
-    """Discs of 5 px whose middles are 32 or 33 px outside."""
+    """Discs of radius 5 px whose centres are 32 or 33 px outside."""
     assert not within_reach(AFAR, np.array([[xy_px[0] / 25, xy_px[1] / 25, 200.0]]), 0.2).any()
 
 
-def test_an_arm_towards_the_camera_reaches_as_far_as_it_is_large():
-    """20 cm are 10 px at 100 m, although most of the body is at 200 m, where they are 5 px."""
+def test_an_arm_near_the_camera_reaches_farther_in_pixels():
+    """20 cm are 10 px at the arm's 100 m, although most of the body is at 200 m, where they are 5 px."""
     arm, body = np.tile([[20 / 50, 20 / 50, 100.0]], (3, 1)), np.tile([[50 / 25, 20 / 25, 200.0]], (20, 1))
     visible_pixels = within_reach(AFAR, np.vstack([arm, body]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [*range(10, 31), *range(40, 60)]
 
 
-def test_pixels_that_are_longer_than_wide_are_reached_by_the_larger_focal_length():
-    """20 cm at 200 m are 5 px of 5000 px across, and 2.5 px of 2500 px along: all within a disc of 5 px."""
+def test_non_square_pixels_use_the_larger_focal_length():
+    """20 cm at 200 m are 5 px across (5000 px focal length) and 2.5 px along (2500 px): all within a disc of 5 px."""
     camera = dataclasses.replace(AFAR, K=np.diag([5000.0, 2500.0, 1.0]))
     visible_pixels = within_reach(camera, np.array([[20 / 25, 20 / 12.5, 200.0]]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [*range(15, 26)]
 
 
-def test_what_is_off_the_axis_reaches_farther_away_from_it():
-    """45 degrees off, at (2, 0, 2) m and column 50, the ray through column p passes at 2 |1 - p / 50| / sqrt(1 + (p /
-    50)^2) m: those of 44 and 57 at 18 cm, those of 43 and 58 at 21 cm."""
+def test_vertices_off_the_axis_reach_farther_outwards():
+    """The vertex at (2, 0, 2) m is 45 degrees off the axis, in column 50. The ray through column p passes it at
+    2 |1 - p / 50| / sqrt(1 + (p / 50)^2) m: 18 cm for columns 44 and 57, 21 cm for columns 43 and 58."""
     visible_pixels = within_reach(AHEAD, np.array([[2.0, 0.0, 2.0]]), 0.2)
     assert np.flatnonzero(visible_pixels[0]).tolist() == [*range(44, 58)]
     from_the_right = dataclasses.replace(AHEAD, K=np.array([[50.0, 0, 60], [0, 50, 0], [0, 0, 1]]))
@@ -203,15 +205,15 @@ def test_what_is_off_the_axis_reaches_farther_away_from_it():
     assert np.flatnonzero(mirrored[0]).tolist() == [*range(3, 17)]
 
 
-def test_what_is_behind_the_camera_covers_nothing():
-    """Of two vertices, the one behind lies on the line through pixel (10, 10)."""
+def test_vertices_behind_the_camera_reach_no_pixels():
+    """Of two vertices, the one behind the camera is on the line through pixel (10, 10)."""
     visible_pixels = within_reach(AHEAD, np.array([[0.8, 0.8, 2.0], [-0.2, -0.2, -1]]), 0.2)
     assert visible_pixels[20, 20] and not visible_pixels[10, 10]
 
 
-def test_a_box_is_met_within_the_outline_of_its_corners():
-    """With its margin the box lies 2 to 4 m away: the near side spans columns 5 to 35 and rows 5 to 25, the far one 2.5
-    to 17.5 and 2.5 to 12.5, and their upper edges are joined by a line through (26.5, 3.75)."""
+def test_a_box_covers_the_convex_hull_of_its_corners():
+    """With its margin, the box is 2 to 4 m away. Its near side spans columns 5 to 35 and rows 5 to 25, its far side
+    columns 2.5 to 17.5 and rows 2.5 to 12.5; a line through (26.5, 3.75) joins their upper right corners."""
     met = within_box(AHEAD, np.array([[0.4, 0.4, 2.2], [1.2, 0.8, 3.8]]), 0.2)
     y, x = np.array([(3, 3), (5, 35), (25, 5), (25, 35), (15, 20), (4, 27)]).T
     assert met[y, x].all()
@@ -219,26 +221,26 @@ def test_a_box_is_met_within_the_outline_of_its_corners():
     assert not met[y, x].any()
 
 
-def test_a_box_around_the_camera_is_met_everywhere():
+def test_a_box_around_the_camera_covers_all_pixels():
     vertices_m = np.array([[-1.0, -1, -1], [1, 1, 1]])
     assert within_box(AHEAD, vertices_m, 0.2).all()
     assert np.array_equal(everywhere(AHEAD, vertices_m), np.ones((40, 60), bool))
 
 
-def test_a_box_that_all_but_touches_the_camera_is_met_where_it_is() -> None:
-    """From 10 um to 2 m ahead, .2 to 1 m to the right and .02 to 1 m down: the ray through (55, 3) is at (1.1 z, .06 z)
-    and enters it at z = 1/3. Its near corners are up to 5 000 000 px away."""
+def test_a_box_that_almost_touches_the_camera_covers_its_pixels() -> None:
+    """The box is 10 um to 2 m ahead, 0.2 to 1 m to the right and 0.02 to 1 m down. The ray through (55, 3) is at
+    (1.1 z, 0.06 z) and enters it at z = 1/3. The near corners of the box project up to 5 000 000 px away."""
     assert within_box(AHEAD, np.array([[0.4, 0.22, 0.20001], [0.8, 0.8, 1.8]]), 0.2)[3, 55]
 
 
-def test_a_box_beside_the_image_is_not_met():
+def test_a_box_beside_the_image_covers_no_pixels():
     assert not within_box(AHEAD, np.array([[-3.0, 0.0, 2.0], [-1.0, 1.0, 2.5]]), 0.2).any()
 
 
 @pytest.mark.parametrize("depths_m", [(-1.0, -2.0), (-1.0, -1.0, 2.0), (1e-6, 1e-6)])
 def test_a_body_behind_or_at_the_camera(depths_m: tuple[float, ...]):
-    """A body behind the camera reaches no pixel, one around it all; of a body on both sides only the part in front
-    counts."""
+    """A body behind the camera reaches no pixel, and one around the camera all of them. Of a body on both sides, only
+    the part in front counts."""
     vertices_m = np.array([[0.4 * depth, 0.4 * depth, depth] for depth in depths_m])
     visible_pixels = within_reach(AHEAD, vertices_m, 0.2)
     assert visible_pixels.shape == (40, 60)

@@ -18,8 +18,8 @@ from tests.training.scene import ALONE, TINY, record
 
 @pytest.fixture(scope="module")
 def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder in which two processes left what `two_ranks.py` writes: first steps by kind of field, and a
-    training that was killed, as torchrun says."""
+    """Run `two_ranks.py` as two processes; return its output folder: first steps by kind of field, and a training that
+    was killed, so torchrun must fail."""
     folder = tmp_path_factory.mktemp("two")
     for name in (*KINDS, "killed"):
         (folder / name).mkdir()
@@ -32,8 +32,8 @@ def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path, two_ranks: Path, kind: str) -> None:
-    """Two gloo processes with half the 128 rays each, in parts of 22 and 21: the gradients are those of one process
-    with all rays. Both skip a step whose loss is not finite in one of them alone."""
+    """Two gloo processes with half of the 128 rays each, in parts of 22 and 21, have the gradients of one process with
+    all rays. Both skip a step in which the loss of only one of them is not finite."""
     alone = untrained(tmp_path / "one", kind, ALONE)
     one, root = gradients(alone, alone.objective), two_ranks / kind
     two = torch.load(root / "gradients.pt", weights_only=True)
@@ -46,10 +46,10 @@ def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path
 
 
 @pytest.mark.usefixtures("any_surface")
-def test_one_process_goes_on_where_two_were_killed(
+def test_one_process_resumes_the_training_of_two_killed_processes(
     tmp_path: Path, two_ranks: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It continues from the checkpoint at step six to the end, with the accuracy of one process from the start."""
+    """It continues from the checkpoint at step 6 to the end, and is as accurate as one process from the start."""
     killed, whole = two_ranks / "killed", tmp_path / "whole"
     whole.mkdir()
     assert (killed / NAME).exists() and not (killed / "model.safetensors").exists()

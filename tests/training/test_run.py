@@ -1,4 +1,4 @@
-"""Exit statuses of a rank."""
+"""Exit statuses and error lines of a rank."""
 
 import sys
 from pathlib import Path
@@ -12,7 +12,7 @@ from hnerf.training.step import TrainingError
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "told"),
+    ("error", "code", "line"),
     [
         (InputError("a.npz: is cut short"), 2, "a.npz: is cut short"),
         (TrainingError("empty"), 3, "empty"),
@@ -20,11 +20,11 @@ from hnerf.training.step import TrainingError
         (OSError("c.png: cannot be written"), 4, '[null, "c.png: cannot be written", null]'),
     ],
 )
-def test_what_is_told_is_a_marked_line_and_an_exit_code(
-    error: Exception, code: int, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_an_error_is_one_marked_line_and_an_exit_code(
+    error: Exception, code: int, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["run", "capture", "cameras", "masks", "fit", "{}", "out"])
     monkeypatch.setattr(run.Distributed, "join", lambda: None)
     monkeypatch.setattr(run.Capture, "load", Mock(side_effect=error))
     assert run.main() == code
-    assert capsys.readouterr().err == f"hnerf: {told}\n"
+    assert capsys.readouterr().err == f"hnerf: {line}\n"

@@ -22,16 +22,16 @@ PERSON = torch.tensor([True, True, False, False])
 EDGE = torch.tensor([False, True, True, False])
 
 
-def aimed(plate: Tensor | None, models_background: bool = False) -> tuple[losses.Target, Draws]:
-    """Return target and draws for pixels inside the person, on both sides of the outline, and in the background."""
+def target_and_draws(plate: Tensor | None, models_background: bool = False) -> tuple[losses.Target, Draws]:
+    """Return the target and draws of four pixels: in the person, on both sides of the outline, in the background."""
     none = torch.zeros(4, 3)
     rays = PixelRays(none, none, torch.zeros(4, dtype=torch.long), SEEN, PERSON, EDGE, plate)
     return make_target(rays, Draws(none, BEYOND, none), models_background)
 
 
 @pytest.mark.parametrize("plate", [None, PLATE])
-def test_a_field_with_a_background_aims_at_the_photograph(plate: Tensor | None) -> None:
-    target, draws = aimed(plate, models_background=True)
+def test_the_target_of_a_field_with_background_is_the_photograph(plate: Tensor | None) -> None:
+    target, draws = target_and_draws(plate, models_background=True)
     assert torch.equal(target.colour, SEEN)
     assert target.weight.tolist() == [1, 1, 1, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
@@ -39,8 +39,8 @@ def test_a_field_with_a_background_aims_at_the_photograph(plate: Tensor | None) 
 
 
 def test_over_a_clean_plate_every_pixel_counts() -> None:
-    """Outline pixels, which mix person and plate, keep the photographed colour; background pixels take the plate's."""
-    target, draws = aimed(PLATE)
+    """Outline pixels, which mix person and plate, keep the photographed colour; background pixels get the plate's."""
+    target, draws = target_and_draws(PLATE)
     assert torch.equal(target.colour, torch.cat([SEEN[:3], PLATE[3:]]))
     assert target.weight.tolist() == [1, 1, 1, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
@@ -48,18 +48,18 @@ def test_over_a_clean_plate_every_pixel_counts() -> None:
 
 
 def test_without_a_plate_surroundings_are_random_and_the_outline_is_left_out() -> None:
-    target, draws = aimed(None)
+    target, draws = target_and_draws(None)
     assert torch.equal(target.colour[[0, 3]], torch.stack([SEEN[0], BEYOND[3]]))
     assert target.weight.tolist() == [1, 0, 0, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
     assert torch.equal(draws.background, BEYOND)
 
 
-def asked(
+def objective_terms(
     settings: TrainingSettings, samples: RaySamples = SAMPLES, depths_m: Tensor | None = None, axis: int | None = None
 ) -> dict[str, Tensor]:
-    """Return the losses of the rays of test_losses, which come down from 1 m along z, through a field whose gamma is
-    80. depths_m: of the samples; axis: the ground's."""
+    """Return the losses of the rays of test_losses, for a field with gamma 80; the rays start at z = 1 m and go down.
+    depths_m: depths of the samples; axis: the vertical axis."""
     field: Any = torch.nn.Module()
     field.models_background, field.gamma = True, 80.0
     field.sample = lambda *inputs: (samples, depths_m)
@@ -70,8 +70,8 @@ def asked(
     return Objective(field, correction, settings, axis)(PosedScene(None, None, None), rays, Draws(down, down, down))
 
 
-def test_each_loss_is_given_its_own_numbers() -> None:
-    """Each of the ten values of test_losses, times its weight."""
+def test_each_loss_gets_its_own_inputs_and_weight() -> None:
+    """Expect each of the ten values of test_losses times its weight."""
     s = LossSettings(
         **{"reconstruction": 2, "mask": 3, "blend": 5, "geometry": 7, "segmentation": 11, "eikonal": 13},
         **{"residual": 17, "fit": 19, "increment": 23, "elastic": 29, "eta": 0.25},
@@ -88,27 +88,27 @@ def test_each_loss_is_given_its_own_numbers() -> None:
         "increment": 23 * 5,
         "elastic": 29 * 0.1,
     }
-    assert {name: term.item() for name, term in asked(TrainingSettings(losses=s)).items()} == pytest.approx(
+    assert {name: term.item() for name, term in objective_terms(TrainingSettings(losses=s)).items()} == pytest.approx(
         expected, rel=1e-5
     )
 
 
-def test_the_floor_is_asked_about_samples_below_the_ground() -> None:
-    """The second sample of the first ray lies 10 cm below the ground, and its d_hat is
-    -0.02: a mean of 0.01 over two rays, times 3. Where the ground is unknown there is no floor."""
+def test_the_floor_loss_covers_samples_below_the_ground() -> None:
+    """The second sample of the first ray is 10 cm below the ground, and its d_hat is -0.02: a mean of 0.01 over two
+    rays, times 3. If the ground is unknown, there is no floor loss."""
     settings, depths_m = TrainingSettings(losses=LossSettings(floor=3)), torch.tensor([[0.9, 1.1], [0.5, 0.8]])
-    known, unknown = (asked(settings, depths_m=depths_m, axis=axis) for axis in (2, None))
+    known, unknown = (objective_terms(settings, depths_m=depths_m, axis=axis) for axis in (2, None))
     assert known["floor"].item() == pytest.approx(0.03)
     assert "floor" not in unknown
 
 
-def test_fog_is_asked_about_the_box() -> None:
+def test_the_fog_loss_covers_samples_in_the_box() -> None:
     settings = TrainingSettings(field=PaperFieldSettings(), losses=LossSettings(fog=31))
-    terms = asked(settings, dataclasses.replace(SAMPLES, in_box=torch.ones(2, 2)))
+    terms = objective_terms(settings, dataclasses.replace(SAMPLES, in_box=torch.ones(2, 2)))
     assert terms["fog"].item() == pytest.approx(31 * 0.1)
 
 
-def test_a_loss_without_weight_is_not_asked() -> None:
+def test_losses_with_zero_weight_are_not_computed() -> None:
     assert LossSettings().elastic == LossSettings().fog == 0
-    terms = asked(TrainingSettings(losses=LossSettings(mask=0, geometry=0)))
+    terms = objective_terms(TrainingSettings(losses=LossSettings(mask=0, geometry=0)))
     assert not {"mask", "geometry", "elastic", "fog"} & terms.keys()

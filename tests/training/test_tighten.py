@@ -14,13 +14,13 @@ RIG = box_rig(splits=2)
 SETTINGS = FastFieldSettings(
     outer_m=0.08, inner_m=0.06, shell_cell_m=0.05, samples=4, geometry_cells=(2,), colour_cells=(2,), pose_width=1
 )
-SEEN_M = 0.005  # to either side of a surface with a logistic of 1000 a metre
+SEEN_M = 0.005  # visible on either side of a surface with a logistic of 1000 per metre
 ROOM_M = 0.012
-STEP_M = 0.004  # at which it is looked for
+STEP_M = 0.004  # of the search for the surface
 
 
 def field_of(residual: Callable[[Tensor, Tensor], Tensor]) -> FastField:
-    """Return a field with a given residual, by y (N, 3) and a pose (P,)."""
+    """Return a field with a given residual, a function of y (N, 3) and a pose (P,)."""
     field = FastField(RIG, SETTINGS, 1)
     field.log_sharpness.data.fill_(1000.0).log_()
     field.field.residual_in_each = lambda y, d, pose: (residual(y, one).expand(len(y)) for one in pose)
@@ -28,8 +28,8 @@ def field_of(residual: Callable[[Tensor, Tensor], Tensor]) -> FastField:
 
 
 def tightened(residual: Callable[[Tensor, Tensor], Tensor], poses: list[float]) -> tuple[Tensor, Tensor]:
-    """Return the thickness outside and inside at the vertices within faces: at edges the closest point of a normal's
-    ray differs."""
+    """Return the tightened thickness outside and inside, at vertices inside the box's faces only: at its edges, points
+    along a vertex normal have another closest point."""
     field = field_of(residual)
     field.tighten(RIG, torch.tensor(poses)[:, None].expand(-1, 3))
     within = ((RIG.vertices_m > 0.1) & (RIG.vertices_m < 0.9)).sum(1) == 2
@@ -40,23 +40,23 @@ def tightened(residual: Callable[[Tensor, Tensor], Tensor], poses: list[float]) 
 @pytest.mark.parametrize(
     ("surfaces_m", "outer_m", "inner_m"),
     [
-        ([0.03], 0.03 + SEEN_M + ROOM_M, ROOM_M),  # nothing is seen inside
+        ([0.03], 0.03 + SEEN_M + ROOM_M, ROOM_M),  # nothing is visible inside
         ([-0.02], ROOM_M, 0.02 + SEEN_M + ROOM_M),
-        ([0.03, -0.02], 0.03 + SEEN_M + ROOM_M, 0.02 + SEEN_M + ROOM_M),  # in the one pose and the other
-        ([0.075], 0.08, ROOM_M),  # never thicker than it was
+        ([0.03, -0.02], 0.03 + SEEN_M + ROOM_M, 0.02 + SEEN_M + ROOM_M),  # one surface in each of two poses
+        ([0.075], 0.08, ROOM_M),  # never thicker than before
     ],
 )
-def test_each_side_is_as_thick_as_its_own_surface_asks_for(
+def test_each_side_is_as_thick_as_its_visible_surface_needs(
     surfaces_m: list[float], outer_m: float, inner_m: float
 ) -> None:
-    """The surface lies at a given height above the skin in each of some poses."""
+    """In each pose, the surface is at a given height above the skin."""
     outer, inner = tightened(lambda y, pose: -pose[0], surfaces_m)
     assert ((outer - outer_m).abs() <= STEP_M + 1e-6).all()
     assert ((inner - inner_m).abs() <= STEP_M + 1e-6).all()
 
 
-def test_vertices_are_tightened_each_by_what_is_seen_there() -> None:
-    """The surface lies 4 cm outside the skin above the middle, at the skin below it."""
+def test_each_vertex_is_tightened_to_the_surface_visible_there() -> None:
+    """The surface is 4 cm outside the skin in the upper half of the body, and at the skin in the lower half."""
     field = field_of(lambda y, pose: torch.where(y[:, 2] > 0.5, -0.04, 0.0))
     field.tighten(RIG, torch.zeros(1, 3))
     x, y, z = RIG.vertices_m.T

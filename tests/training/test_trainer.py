@@ -28,9 +28,11 @@ pytestmark = pytest.mark.usefixtures("any_surface")
 
 
 @pytest.mark.parametrize("kind", ["fast", "paper"])
-def test_interrupted_training_ends_as_if_it_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str):
-    """What there is after ten steps, resumed from the checkpoint at six: the same weights, poses and losses, bit by
-    bit."""
+def test_an_interrupted_training_ends_like_an_uninterrupted_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+):
+    """A training interrupted after ten steps resumes from the checkpoint at six. It ends with the same weights, poses
+    and losses, bit by bit."""
     recording = record(tmp_path / "capture")
     settings = tiny(kind, rays_per_frame=16)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
@@ -58,7 +60,7 @@ def test_interrupted_training_ends_as_if_it_was_not(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("novel_pose_steps", [0, 1])
-def test_a_finished_training_that_was_stopped_before_its_files_were_safe_only_writes_them_again(
+def test_a_training_stopped_after_its_last_step_only_writes_its_files_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, novel_pose_steps: int
 ) -> None:
     recording, settings = record(tmp_path / "capture"), tiny(steps=2, novel_pose_steps=novel_pose_steps)
@@ -68,12 +70,12 @@ def test_a_finished_training_that_was_stopped_before_its_files_were_safe_only_wr
     again = train(*recording, settings, tmp_path, ALONE)
     assert again["steps"] == first["steps"] == 2 + novel_pose_steps
     kept = {name for name, content in written.items() if (tmp_path / name).read_bytes() == content}
-    assert written.keys() - kept <= {"report.json"}  # setup took another time
+    assert written.keys() - kept <= {"report.json"}  # the setup took a different time
 
 
-def test_overfits_the_column(tmp_path: Path):
-    """A few seconds suffice for a render of a training view within 40 dB, in the right place. The photograph's outline,
-    unlike a rendering's, is not antialiased; it is left out."""
+def test_a_field_can_overfit_the_column(tmp_path: Path):
+    """After a few seconds of training, a rendered training view has more than 40 dB and the right depth. Outlines are
+    left out, because those of the photograph are not antialiased."""
     capture, masks, body = record(tmp_path / "capture")
     rates = {"network_learning_rate": 0.02, "grid_learning_rate": 0.05}
     fast = TINY.field.model_dump() | rates | {"samples": 32, "outer_m": 0.1}
@@ -90,8 +92,8 @@ def test_overfits_the_column(tmp_path: Path):
     assert drawn.depth_m[mask].mean().item() == pytest.approx(3.6, abs=0.4)
 
 
-def test_the_paper_learns_by_its_nine_losses_and_fog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """With the preset's weights, on the same batch repeatedly, so that random batches do not hide what is learned."""
+def test_the_paper_preset_reduces_its_nine_losses_and_fog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With the weights of the preset, on the same batch in every step, so that random batches do not hide progress."""
     losses = load_settings("paper").training.losses
     few = {"steps": 15, "novel_pose_steps": 0, "rays_per_frame": 32}
     settings = tiny(field={"kind": "paper", "samples": 16}, losses=losses, **few)
@@ -111,8 +113,8 @@ def test_the_paper_learns_by_its_nine_losses_and_fog(tmp_path: Path, monkeypatch
     assert sum(last.values()) < 0.95 * sum(first.values())
 
 
-def test_loads_after_the_shape_has_changed(tmp_path: Path):
-    """The grids' extent is that of the body before its shape was tuned, whatever the tuned shape is."""
+def test_a_model_loads_after_the_shape_has_changed(tmp_path: Path):
+    """The extent of the grids comes from the body before its shape was tuned, also in the loaded avatar."""
     trainer = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
     with torch.no_grad():
         trainer.objective.correction.shape += 0.2  # 20 cm taller
@@ -124,9 +126,9 @@ def test_loads_after_the_shape_has_changed(tmp_path: Path):
         torch.testing.assert_close(loaded, learned, rtol=0, atol=within, msg=name)
 
 
-def test_time_ends_the_field_and_slows_it_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """With steps of a quarter of a second, one second is over after four of them, when rates have fallen to a tenth;
-    the novel poses still get their four."""
+def test_a_time_limit_ends_the_field_and_lowers_learning_rates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With steps of 0.25 s, a limit of one second ends the field after four of them, when learning rates have fallen to
+    a tenth. Novel poses still get their four steps."""
     trainer = Trainer(*record(tmp_path / "capture"), tiny(seconds=1.0, steps=1000), tmp_path, ALONE)
     monkeypatch.setattr(trainer_module, "WARM_UP_STEPS", 1)
     now_s = 0.0
@@ -145,7 +147,7 @@ def test_time_ends_the_field_and_slows_it_down(tmp_path: Path, monkeypatch: pyte
     assert trainer.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * trainer.first_rates[0])
 
 
-def test_a_snapshot_is_a_subject(tmp_path: Path):
+def test_a_snapshot_can_be_loaded_and_rendered(tmp_path: Path):
     capture, masks, body = record(tmp_path / "capture")
     Trainer(capture, masks, body, tiny(snapshots_s=[1e-6], steps=2, novel_pose_steps=0), tmp_path, ALONE).run()
     early, late = load_avatar(tmp_path / "snapshots" / "1e-06"), load_avatar(tmp_path)
@@ -153,10 +155,10 @@ def test_a_snapshot_is_a_subject(tmp_path: Path):
     assert early.render(capture.cameras["0"], early.body.theta[0], early.body.root[0]).alpha.max() > 0.5
 
 
-def test_a_checkpoint_without_the_snapshots_before_it_is_discarded(
+def test_a_checkpoint_without_its_earlier_snapshots_is_discarded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Another machine has them; those that are not due yet are of no concern."""
+    """The snapshots may be on another machine. Those that are not due yet may be missing."""
     recording, snapshot = record(tmp_path / "capture"), tmp_path / "snapshots"
     settings = tiny(snapshots_s=[1e-6, 1e6], steps=2, novel_pose_steps=0)
     train(*recording, settings, tmp_path, ALONE)
@@ -176,9 +178,9 @@ def test_a_model_of_another_version_is_refused(tmp_path: Path):
         load_avatar(tmp_path)
 
 
-def test_novel_pixels_never_reach_the_field(tmp_path: Path):
-    """Without the second phase, and with other colours in the novel frame, the field is the same to the bit: it learns
-    from training frames alone. Training poses and deformations stay, too; those of the novel frame change."""
+def test_novel_poses_never_train_the_field(tmp_path: Path):
+    """The field learns only from training frames: without the second phase, or with it and other colours in the novel
+    frame, it is the same to the bit. Training poses and deformations stay, too; those of the novel frame change."""
     models = []
     for steps in (0, 4):
         out = tmp_path / f"{steps}"
@@ -197,8 +199,9 @@ def test_novel_pixels_never_reach_the_field(tmp_path: Path):
     assert (poses[0][2] - poses[1][2]).abs().max() > 2e-5
 
 
-def test_finished_poses_stay_whatever_pulls_them_to_the_fit(tmp_path: Path):
-    """While novel poses are fitted, the increment loss still covers all frames, and training has left momentum."""
+def test_training_poses_do_not_change_while_novel_poses_are_fitted(tmp_path: Path):
+    """While novel poses are fitted, the increment loss still covers all frames, and the optimiser still has
+    momentum."""
     recording, bodies = record(tmp_path / "capture"), []
     for steps in (0, 4):
         settings = tiny(novel_pose_steps=steps, losses=TINY.losses.model_copy(update={"increment": 1.0}))
@@ -210,7 +213,7 @@ def test_finished_poses_stay_whatever_pulls_them_to_the_fit(tmp_path: Path):
     torch.testing.assert_close(bodies[0].root[:2], bodies[1].root[:2], atol=1e-6, rtol=0)
 
 
-def test_training_frames_of_one_posture_keep_one(tmp_path: Path):
+def test_training_frames_with_one_posture_keep_one(tmp_path: Path):
     """Joint angles change equally in all training frames; roots and the novel frame change independently."""
     capture, masks, body = record(tmp_path / "capture")
     rows = [body.index(frame) for frame in capture.train_frames]
@@ -225,9 +228,10 @@ def test_training_frames_of_one_posture_keep_one(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("kind", "common"), [("fast", True), ("paper", False)])
-def test_what_all_poses_changed_alike_is_the_rest_bodys(tmp_path: Path, kind: str, common: bool):
-    """Training poses then have a mean rotation of zero, and a new pose gets the same change: its theta stays as fitted,
-    while the rest body's vertices move. The published method keeps its rest body."""
+def test_the_common_change_of_all_poses_moves_to_the_rest_body(tmp_path: Path, kind: str, common: bool):
+    """Training poses then have a mean change of zero. A novel pose gets the common change through the rest body: its
+    theta stays as fitted, while the vertices of the rest body move. The published method does not change its rest
+    body."""
     capture, masks, body = record(tmp_path / "capture")
     settings = tiny(kind, pose_learning_rate=0.01, novel_pose_steps=0)
     trainer = Trainer(capture, masks, body, settings, tmp_path, ALONE)
@@ -246,15 +250,15 @@ def test_what_all_poses_changed_alike_is_the_rest_bodys(tmp_path: Path, kind: st
         assert displacement[-1].abs().max() > 0
 
 
-def test_a_single_training_frame_has_nothing_to_deform(tmp_path: Path):
-    """The novel frames' poses are fitted nevertheless."""
+def test_with_a_single_training_frame_there_is_no_deformation(tmp_path: Path):
+    """The poses of novel frames are still fitted."""
     capture, masks, body = record(tmp_path / "capture")
     train(replace(capture, train_frames=FRAMES[:1]), masks, body, tiny(novel_pose_steps=8), tmp_path, ALONE)
     assert not any("deformation" in name for name in load_file(tmp_path / "model.safetensors"))
     assert (load_avatar(tmp_path).body.theta[2] - body.theta[2]).abs().max() > 2e-5
 
 
-def test_not_a_number_stops_the_run_with_its_cause(
+def test_nan_losses_stop_the_run_with_their_cause(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     trainer = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
@@ -273,7 +277,7 @@ def test_not_a_number_stops_the_run_with_its_cause(
 
 
 def test_a_gradient_that_is_not_finite_skips_the_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The square root of a sum of squares has such a gradient at zero, where its value is finite."""
+    """The gradient of a square root at zero is not finite, although its value is."""
     trainer = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
     before = {name: p.clone() for name, p in trainer.field.named_parameters()}
     whole = trainer.objective.forward
@@ -289,7 +293,7 @@ def test_a_gradient_that_is_not_finite_skips_the_step(tmp_path: Path, monkeypatc
     assert all(torch.equal(before[name], p) for name, p in trainer.field.named_parameters())
 
 
-def test_frames_that_never_show_the_person_have_no_curve(tmp_path: Path):
+def test_held_out_frames_that_do_not_show_the_person_are_not_scored(tmp_path: Path):
     trainer = Trainer(*record(tmp_path / "capture"), tiny(), tmp_path, ALONE)
     trainer.step = trainer.field_steps
     trainer._record({})
@@ -298,7 +302,7 @@ def test_frames_that_never_show_the_person_have_no_curve(tmp_path: Path):
     assert ["held_out" in row for row in trainer.history] == [True, False]
 
 
-def test_the_curve_has_a_point_every_hundred_steps(tmp_path: Path):
+def test_the_curve_has_a_point_at_every_hundred_steps(tmp_path: Path):
     trainer = Trainer(*record(tmp_path / "capture"), tiny(), tmp_path, ALONE)
     trainer.field_steps = 250
     for step in (1, 25, 100, 125, 250, 275):
@@ -307,7 +311,7 @@ def test_the_curve_has_a_point_every_hundred_steps(tmp_path: Path):
     assert ["held_out" in row for row in trainer.history] == [True, False, True, False, True, False]
 
 
-def test_progress_is_told_in_words():
+def test_the_progress_message():
     row = {"step": 25, "seconds": 7.0, "losses": {"reconstruction": 0.1234, "elastic": 0.0}}
     assert trainer_module._progress_message(row) == "reconstruction 0.12"
     assert (
@@ -316,7 +320,7 @@ def test_progress_is_told_in_words():
     )
 
 
-def test_checkpoint_is_replaced_whole(tmp_path: Path):
+def test_a_checkpoint_is_replaced_atomically(tmp_path: Path):
     save_checkpoint(tmp_path, {"key": "mine", "step": 1, "x": torch.ones(2)})
     save_checkpoint(tmp_path, {"key": "mine", "step": 2, "x": torch.zeros(2)})
     assert [p.name for p in tmp_path.iterdir()] == [NAME]
@@ -335,13 +339,13 @@ def test_a_damaged_checkpoint_is_discarded_with_a_warning(
     assert "checkpoint.pt: cannot be read" in warning and "\n" not in warning
 
 
-def test_a_checkpoint_with_a_bit_of_a_weight_flipped_is_discarded_with_a_warning(
+def test_a_checkpoint_with_a_flipped_bit_is_discarded_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As a disk or a bucket may return it; torch alone would read it."""
+    """A disk or a bucket may return such a file; torch itself would read it without an error."""
     save_checkpoint(tmp_path, {"key": "mine", "x": torch.full((1000,), 1.25)})
     written = bytearray((tmp_path / NAME).read_bytes())
-    written[written.index(torch.full((500,), 1.25).numpy().tobytes()) + 1003] ^= 0x40  # the exponent of one
+    written[written.index(torch.full((500,), 1.25).numpy().tobytes()) + 1003] ^= 0x40  # in the exponent of one weight
     (tmp_path / NAME).write_bytes(written)
     assert load_checkpoint(tmp_path, torch.device("cpu"), "mine") is None
     (warning,) = caplog.messages
@@ -354,7 +358,7 @@ def test_a_checkpoint_of_another_training_is_discarded(tmp_path: Path, caplog: p
     assert "checkpoint.pt: is of another training" in caplog.text
 
 
-def test_other_settings_and_poses_are_another_training(tmp_path: Path) -> None:
+def test_other_settings_or_poses_have_another_training_key(tmp_path: Path) -> None:
     capture, masks, body = record(tmp_path / "capture")
     moved = replace(body, root=body.root + 1e-3)
     scenes = [(body, TINY), (body, TINY.model_copy(update={"seed": 1})), (moved, TINY)]
@@ -363,8 +367,8 @@ def test_other_settings_and_poses_are_another_training(tmp_path: Path) -> None:
     assert len(keys) == 3 and training_key(capture, masks, body, same) in keys
 
 
-def test_a_full_disk_is_an_os_error_and_what_filled_it_goes(tmp_path: Path):
-    """torch reports the second one as a RuntimeError."""
+def test_a_full_disk_is_an_os_error_and_leaves_no_partial_checkpoint(tmp_path: Path):
+    """torch alone reports such a failure as a RuntimeError."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, limits[1]))
     try:
@@ -375,9 +379,9 @@ def test_a_full_disk_is_an_os_error_and_what_filled_it_goes(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_halves_side_by_side_have_the_gradients_of_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """On a CPU with two threads, whichever half ends first: bit by bit the same each time, and equal to one batch
-    except for the order of sums."""
+def test_two_parallel_halves_have_the_gradients_of_the_whole_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """On a CPU with two threads, gradients are the same bit by bit each time, whichever half ends first, and equal
+    those of one batch except for the order of sums."""
     gradients = []
     for threads in (1, 2, 2):
         monkeypatch.setattr(torch, "get_num_threads", lambda n=threads: n)
@@ -395,7 +399,7 @@ def test_two_halves_side_by_side_have_the_gradients_of_the_whole(tmp_path: Path,
 
 
 def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path):
-    """The paper draws uniformly from all pixels; a composited field needs those near the person."""
+    """The published method draws uniformly from all pixels; a composited field needs pixels near the person."""
     scene = record(tmp_path)
     height, width = scene[0].image("0", 0).shape[:2]
     images = len(scene[0].train_cameras) * len(scene[2].frames)
@@ -405,8 +409,10 @@ def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path)
         assert trainer.edge_share == pytest.approx(edge_share)
 
 
-def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The settings ask for four frames of 64 rays; there are two training frames and one novel frame."""
+def test_the_number_of_rays_per_step_does_not_depend_on_the_number_of_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The settings request four frames of 64 rays, but there are only two training frames and one novel frame."""
     drawn = []
     draw = Pixels.draw
 
@@ -422,7 +428,7 @@ def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypa
     assert drawn == [(2, 128), (1, 256)]
 
 
-def test_progress_counts_steps_of_both_phases_and_time_where_that_is_ahead(caplog: pytest.LogCaptureFixture) -> None:
+def test_progress_counts_steps_of_both_phases_or_time_if_that_is_ahead(caplog: pytest.LogCaptureFixture) -> None:
     trainer = Trainer.__new__(Trainer)
     trainer.settings = TrainingSettings(steps=10, seconds=20, novel_pose_steps=4)
     trainer.novel_rows = torch.zeros(1)

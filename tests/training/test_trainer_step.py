@@ -1,4 +1,4 @@
-"""What the trainer passes to a step: which pixels, with what noise, around which bodies."""
+"""The inputs that the trainer passes to a step: pixels, noise and bodies."""
 
 import dataclasses
 from pathlib import Path
@@ -19,8 +19,8 @@ from tests.training.scene import ALONE, TINY, record, tiny
 H_NERF = pytest.mark.parametrize("kind", ["fast", "paper"])
 
 
-class Listener(torch.nn.Module):
-    """Stand-in for the objective that keeps its arguments, whatever the number of parts."""
+class RecordingObjective(torch.nn.Module):
+    """A stand-in for the objective that keeps its arguments, for any number of parts."""
 
     def __init__(self, trainer: Trainer):
         super().__init__()
@@ -41,17 +41,17 @@ def trainer_of(folder: Path, cameras: tuple[str, ...] = ("0", "1", "2", "3"), **
     return Trainer(capture, masks, body, tiny(**changes), folder, ALONE)
 
 
-def handed_over(trainer: Trainer) -> Listener:
-    listener = Listener(trainer)
+def step_inputs(trainer: Trainer) -> RecordingObjective:
+    listener = RecordingObjective(trainer)
     trainer._optimise(listener)
     return listener
 
 
 @H_NERF
 def test_noise_reaches_the_networks(tmp_path: Path, kind: str) -> None:
-    """Noise of 0.1 on theta, T and v: root mean squares over the 9, 36 and 384 numbers drawn."""
+    """Noise of 0.1 on theta, T and v: root mean squares over the 9, 36 and 384 numbers that are drawn."""
     trainer = trainer_of(tmp_path, kind=kind)
-    listener = handed_over(trainer)
+    listener = step_inputs(trainer)
     for _, conditions, _ in listener.parts:
         for noise, least, most in (
             (conditions.pose - trainer.scene.conditions.pose, 0.03, 0.25),
@@ -63,9 +63,9 @@ def test_noise_reaches_the_networks(tmp_path: Path, kind: str) -> None:
     assert view.shape == (128, 3) and 0.09 < view.square().mean().sqrt() < 0.11
 
 
-def test_no_noise_where_none_is_asked_for(tmp_path: Path) -> None:
+def test_there_is_no_noise_if_it_is_set_to_zero(tmp_path: Path) -> None:
     trainer = trainer_of(tmp_path, noise=0.0)
-    listener = handed_over(trainer)
+    listener = step_inputs(trainer)
     for _, conditions, _ in listener.parts:
         assert torch.equal(conditions.pose, trainer.scene.conditions.pose)
         assert torch.equal(conditions.root, trainer.scene.conditions.root)
@@ -73,16 +73,16 @@ def test_no_noise_where_none_is_asked_for(tmp_path: Path) -> None:
 
 
 def test_frames_of_novel_poses_are_not_trained_on(tmp_path: Path) -> None:
-    """Rows 0 and 1 are drawn while the field learns, row 2 when it is finished."""
+    """Rows 0 and 1 are drawn while the field is trained, row 2 only once it is finished."""
     trainer = trainer_of(tmp_path)
-    assert handed_over(trainer).all(0, "frame").unique().tolist() == [0, 1]
+    assert step_inputs(trainer).all(0, "frame").unique().tolist() == [0, 1]
     trainer.step = trainer.field_steps
-    assert handed_over(trainer).all(0, "frame").unique().tolist() == [2]
+    assert step_inputs(trainer).all(0, "frame").unique().tolist() == [2]
 
 
-def test_only_what_belongs_to_novel_frames_is_fitted_to_a_finished_field(tmp_path: Path) -> None:
-    """Only their pose and displacement change: neither the field nor training frames nor the shape, although a loss
-    acts on all."""
+def test_only_novel_frames_are_fitted_to_a_finished_field(tmp_path: Path) -> None:
+    """Only the pose and the displacement of novel frames change: neither the field, nor training frames, nor the shape,
+    although a loss acts on all of them."""
     trainer = trainer_of(tmp_path, losses=TINY.losses.model_copy(update={"increment": 1.0}))
     with torch.no_grad():
         for parameter in trainer.objective.correction.parameters():
@@ -111,10 +111,10 @@ def test_rates_rise_for_20_steps_and_fall_to_a_tenth(tmp_path: Path) -> None:
 
 
 def test_exposure_is_corrected_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Camera 2 shows red twice as bright as the others: the person is (200, 50, 50) before a plate of 128."""
+    """Camera 2 shows red twice as bright as the others. The person is (200, 50, 50) in front of a plate of 128."""
     gains = dict.fromkeys("0123", (1.0, 1.0, 1.0)) | {"2": (2.0, 1.0, 1.0)}
     monkeypatch.setattr(trainer_module, "camera_gains", lambda *inputs: (gains, Decision(2.0, "twice as bright")))
-    handed = handed_over(trainer_of(tmp_path, rays_per_frame=512))
+    handed = step_inputs(trainer_of(tmp_path, rays_per_frame=512))
     colour, plate, person, edge = (handed.all(0, name) for name in ("colour", "plate", "person", "edge"))
     bright = handed.all(0, "origins_m")[:, 0] < -3  # camera 2 stands at x = -3.5 m
     for camera, red, grey in ((bright, [100, 50, 50], [64, 128, 128]), (~bright, [200, 50, 50], [128, 128, 128])):
@@ -122,9 +122,9 @@ def test_exposure_is_corrected_before_training(tmp_path: Path, monkeypatch: pyte
         assert (255 * plate[camera & ~edge]).round().unique(dim=0).tolist() == [grey]
 
 
-def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_path: Path) -> None:
-    """Starting from 20 cm: untrained, the surface is the skin, whose logistic of 100 per metre saturates 5 cm from it;
-    1.2 cm are left as a margin. Rays are then sampled in the new region."""
+def test_the_shell_is_tightened_at_each_absorption_until_the_field_is_finished(tmp_path: Path) -> None:
+    """The shell starts at 20 cm. The untrained surface is the skin, whose logistic of 100 per metre saturates 5 cm from
+    it; with a margin of 1.2 cm, the shell shrinks to 6.2 cm. Rays are then sampled in the new region."""
     trainer = trainer_of(tmp_path, absorb_steps=1)
     cells = (trainer.scene.region.cells == 1).sum()
     trainer.step = trainer.field_steps + 1
@@ -139,9 +139,9 @@ def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_
 
 @pytest.mark.usefixtures("any_surface")
 @H_NERF
-def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, kind: str) -> None:
-    """After a bend of 0.1 and a move of 1 cm are absorbed, the conditions include them and the correction is zero.
-    `fast` gives what both training frames have in common, half, to the rest body; the novel frame gets neither."""
+def test_bodies_absorb_the_learned_corrections(tmp_path: Path, kind: str) -> None:
+    """Once a bend of 0.1 and a move of 1 cm are absorbed, the conditions include them and the correction is zero.
+    `fast` moves the part that both training frames share, half, to the rest body; the novel frame does not change."""
     common = 0.5 if kind == "fast" else 0.0
     trainer = trainer_of(tmp_path, kind=kind)
     before = trainer.scene.conditions
@@ -160,10 +160,10 @@ def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, kind: str) -> N
 
 @pytest.mark.usefixtures("any_surface")
 @H_NERF
-def test_one_camera_keeps_the_fits_mean_distance(tmp_path: Path, kind: str) -> None:
-    """Two bodies stand at the origin, L from the camera at c. The first learns to stand at 1.1 L: the mean is 1.05 L,
-    so both are scaled by 1 / 1.05, to -c / 21 and c / 21. The novel frame, later fitted to the finished field, stays,
-    and may then move."""
+def test_with_one_camera_the_mean_distance_of_the_fit_is_kept(tmp_path: Path, kind: str) -> None:
+    """Two bodies stand at the origin, at a distance L from the camera at c. The first learns to stand at 1.1 L: the
+    mean is 1.05 L, so both distances are scaled by 1 / 1.05, to positions -c / 21 and c / 21. The novel frame keeps its
+    own move: it is fitted to the finished field later."""
     trainer = trainer_of(tmp_path, ("0",), kind=kind)
     centre_m = torch.tensor([4.5, 0.5, 1.5])  # of camera 0
     with torch.no_grad():
@@ -177,8 +177,8 @@ def test_one_camera_keeps_the_fits_mean_distance(tmp_path: Path, kind: str) -> N
     assert torch.allclose(2.5 * trainer.scene.conditions.root[:, 3::4], expected_m, atol=1e-5)
 
 
-def test_several_cameras_see_how_far_away_somebody_is(tmp_path: Path) -> None:
-    """With two, a body that learns to stand a metre away from the first stands there."""
+def test_with_several_cameras_bodies_may_change_their_distance(tmp_path: Path) -> None:
+    """With two cameras, a body that learns to stand a metre farther away stays there."""
     trainer = trainer_of(tmp_path, ("0", "1"), kind="paper")
     with torch.no_grad():
         trainer.objective.correction.move_m[0, 0] = -1.0
@@ -187,6 +187,6 @@ def test_several_cameras_see_how_far_away_somebody_is(tmp_path: Path) -> None:
     assert trainer.scene.bodies.root[0, :3, 3].tolist() == pytest.approx([-1, 0, 0], abs=1e-5)
 
 
-def test_the_recordings_vertical_axis_leads_to_the_ground(tmp_path: Path) -> None:
+def test_the_ground_axis_is_the_vertical_axis_of_the_recording(tmp_path: Path) -> None:
     assert trainer_of(tmp_path / "known", ground=True).objective.ground_axis == 2
     assert trainer_of(tmp_path / "unknown", ground=False).objective.ground_axis is None

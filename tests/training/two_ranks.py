@@ -1,5 +1,5 @@
-"""What two processes under torchrun do for test_ranks.py: a first step of each kind, then a training in which one of
-them is killed. In one program, because it takes seconds to start.
+"""The program that test_ranks.py runs as two processes under torchrun: a first step of each kind of field, then a
+training in which one process is killed. It is a single program because starting one takes seconds.
 
 usage: python -m torch.distributed.run --nproc-per-node=2 -m tests.training.two_ranks FOLDER PARTS
 """
@@ -21,7 +21,7 @@ KILLED_AT = 8  # two steps after the checkpoint
 
 
 class KilledTrainer(Trainer):
-    """A training of which the second process is killed."""
+    """A trainer whose second process is killed at step KILLED_AT."""
 
     def _optimise(self, module: torch.nn.Module) -> dict[str, Tensor]:
         if self.step == KILLED_AT and self.processes.rank == 1:
@@ -30,7 +30,7 @@ class KilledTrainer(Trainer):
 
 
 def main(folder: Path, parts: int) -> None:
-    """Write what test_ranks.py looks at, in folders that it made."""
+    """Write the results that test_ranks.py checks into folders that it has created."""
     torch.set_num_threads(1)
     for module, name, value in SHRUNK_CONSTANTS:
         setattr(module, name, value)
