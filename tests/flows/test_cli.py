@@ -143,7 +143,7 @@ def test_the_error_of_a_full_disk_is_one_line_with_exit_code_1(
 def test_commands_that_read_a_recording_accept_its_memory_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The error for too little memory advises to raise this setting."""
+    """The error message about too little memory advises users to raise this setting."""
     found = []
     monkeypatch.setattr("tasks.cage.run_caged", lambda *_, **__: found.append(current_limits().reader_gib))
     for command in (["calibrate"], ["synchronise"], ["export-cameras", "--format", "colmap"]):

@@ -68,7 +68,7 @@ def test_an_unreachable_server_does_not_end_the_work(monkeypatch: pytest.MonkeyP
     page.show(run_page.Progress("fit", 1, 2))
 
 
-def test_pictures_are_shrunk_and_embedded(tmp_path: Path) -> None:
+def test_images_are_shrunk_and_embedded(tmp_path: Path) -> None:
     Image.new("RGBA", (1280, 320), (255, 0, 0, 255)).save(tmp_path / "a.png")
     text = embedded([("front", tmp_path / "a.png")])
     head, _, uri = text.rstrip(")").partition("data:image/jpeg;base64,")

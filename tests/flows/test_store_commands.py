@@ -62,7 +62,7 @@ def test_export_and_import(store: Store, capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.mark.parametrize("command", ["list", "verify", "gc --yes --older 0", "show ada", "export ada"])
-def test_a_folder_that_is_no_store_is_refused(
+def test_a_folder_that_is_not_a_store_is_refused(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -150,7 +150,7 @@ def test_a_run_returns_its_own_results_even_if_another_run_ends_last(folder: Pat
 def test_hands_detected_by_a_concurrent_run_are_not_linked(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both runs have the same recording, but other settings."""
+    """Both runs have the same recording, but different settings."""
     evaluate = module.evaluate
 
     def linked(artifact_store: store.Store, *inputs: Any) -> Artifact:

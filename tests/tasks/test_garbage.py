@@ -37,7 +37,7 @@ def garbage(store: Store, keep: int = 1, older_s: float = 0.0) -> set[str]:
     return {f"{one.stage}/{one.key}" for one in find_garbage(Inventory.of(store), keep, older_s)}
 
 
-def test_latest_results_and_what_they_were_computed_from_stay(store: Store) -> None:
+def test_latest_results_and_their_inputs_stay(store: Store) -> None:
     before, now, other = run_of(store, "ada", 10), run_of(store, "ada", 20), run_of(store, "bob", 30)
     assert garbage(store) == names(before)
     for one in find_garbage(Inventory.of(store), 1, 0):
@@ -107,7 +107,7 @@ def test_artifacts_in_use_stay_until_their_process_is_killed(store: Store) -> No
 
 
 def test_garbage_can_be_listed_in_a_read_only_store(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tests may run as root, who may write anywhere, so removal is made to fail."""
+    """Tests may run as root, which may write anywhere, so removal is made to fail."""
     before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
     (store.root / pins.FOLDER).mkdir(exist_ok=True)
     (store.root / pins.FOLDER / "0dead").write_text(f"{before[0].name}\n")

@@ -118,8 +118,8 @@ def test_a_resumable_stage_continues_from_its_partial_folder(tmp_path: Path) -> 
 def test_finished_work_that_could_not_be_recorded_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: int
 ) -> None:
-    """The disk is full, or the process is killed, before one of three renames: that of the note of the use, that of the
-    record, or that of the folder."""
+    """The disk is full, or the process is killed, before one of three renames: of the usage note, of
+    the record, or of the folder."""
 
     def work(out: Path) -> dict[str, float]:
         resumed = (out / "checkpoint.pt").exists()
@@ -227,7 +227,7 @@ def test_a_link_in_place_of_a_lock_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_complete_store_can_be_read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tests may run as root, who may write anywhere, so every function that writes is made to fail."""
+    """Tests may run as root, which may write anywhere, so every function that writes is made to fail."""
     store = Store(tmp_path)
     made = store.link_latest("ada", store.get_or_compute("fit", "k", write_abc))
     store.claim("ada", "d", tmp_path / "captures" / "ada")

@@ -27,7 +27,7 @@ def test_the_checkpoint_is_kept_until_training_ends_and_is_not_in_the_artifact(
     given = Artifact(stage="capture", root=tmp_path, files={})
     with pytest.raises(OSError, match="lost"):
         module.train(Store(tmp_path), given, given, given, given, TrainingSettings())
-    with monkeypatch.context() as one_gpu:  # an impossible request keeps the checkpoint
+    with monkeypatch.context() as one_gpu:  # a refused request keeps the checkpoint
         one_gpu.setattr("torch.cuda.device_count", lambda: 1)
         with pytest.raises(
             InputError, match=r"^training\.processes=2: each process needs a GPU, and this machine has 1;"

@@ -45,5 +45,5 @@ def write_first_step(folder: Path, kind: str, parts: int, processes: Distributed
     forward, odd = trainer.objective.forward, torch.tensor(float("nan") if processes.rank else 0.0)
     trainer.objective.forward = lambda *batch: forward(*batch) | {"odd": odd}  # type: ignore[method-assign]
     finite = gradients(trainer, module)
-    assert all(gradient.isfinite().all() for gradient in finite.values())  # so they do not reveal it
+    assert all(gradient.isfinite().all() for gradient in finite.values())  # only the loss is not
     (folder / f"skipped{processes.rank}").write_text(str(trainer.skipped))

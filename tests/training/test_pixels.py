@@ -168,7 +168,7 @@ def test_a_body_inside_the_image_reaches_a_disc_around_each_vertex():
     assert np.array_equal(visible_pixels, squared.min(-1) <= 25)
 
 
-def test_a_body_beside_the_image_reaches_into_it():
+def test_a_body_just_outside_the_image_reaches_into_it():
     """A vertex 3 px left of the image in row 20 reaches a disc of radius 5 px: columns 0 to 2 of that row."""
     visible_pixels = within_reach(AFAR, np.array([[-3 / 25, 20 / 25, 200.0]]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [0, 1, 2]
@@ -176,7 +176,7 @@ def test_a_body_beside_the_image_reaches_into_it():
 
 
 @pytest.mark.parametrize("xy_px", [(-32, 20), (30, -32), (92, 20), (30, 72)])
-def test_a_body_far_beside_the_image_does_not_reach_it(xy_px: tuple[int, int]):
+def test_a_body_far_outside_the_image_does_not_reach_it(xy_px: tuple[int, int]):
     """Discs of radius 5 px whose centres are 32 or 33 px outside."""
     assert not within_reach(AFAR, np.array([[xy_px[0] / 25, xy_px[1] / 25, 200.0]]), 0.2).any()
 
@@ -233,7 +233,7 @@ def test_a_box_that_almost_touches_the_camera_covers_its_pixels() -> None:
     assert within_box(AHEAD, np.array([[0.4, 0.22, 0.20001], [0.8, 0.8, 1.8]]), 0.2)[3, 55]
 
 
-def test_a_box_beside_the_image_covers_no_pixels():
+def test_a_box_outside_the_image_covers_no_pixels():
     assert not within_box(AHEAD, np.array([[-3.0, 0.0, 2.0], [-1.0, 1.0, 2.5]]), 0.2).any()
 
 
