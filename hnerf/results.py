@@ -1,6 +1,6 @@
-"""The JSON that stages write: every key with its type and unit; other keys are refused when a file is written.
+"""Types of the JSON files that stages write: every key with its type and unit. Writing a file with any other key fails.
 
-`python -m hnerf.results FOLDER` writes a JSON schema of each file, as in docs/schemas/.
+`python -m hnerf.results FOLDER` writes the JSON schema of each file, as in docs/schemas/.
 """
 
 import argparse
@@ -13,16 +13,15 @@ from typing_extensions import TypedDict
 
 Split = Literal["novel_view", "novel_pose", "novel_pose_posed", "novel_pose_tracked"]
 Mean = Literal["psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr"]
-Primary = Literal["novel_view", "novel_pose"]  # splits that are meshed, and that held-out cameras are scored on
+Primary = Literal["novel_view", "novel_pose"]  # these splits are meshed and score held-out cameras
 
 
 class FitReport(TypedDict):
-    """report.json of the body fit; lists over frames. seconds: of each part, and in no file.
-
-    silhouette_iou: with the masks, null without any; beta: shape values by name; keypoint_offsets_m (25, 3): between
-    where the detector and the body model place a keypoint; given_poses: how poses that came with the recording were
-    used; on_ground: with one camera, whether world height 0 counted as the ground.
-    """
+    """report.json of the body fit; lists have one value per frame. seconds: duration of each part, not written to the
+    file. silhouette_iou: IoU of the body's silhouette with the masks, null without masks. beta: shape values by name.
+    keypoint_offsets_m (25, 3): offset between where the detector and the body model place each keypoint. given_poses:
+    how poses that came with the recording were used. on_ground: with one camera, whether world height 0 was taken as
+    the ground."""
 
     seconds: NotRequired[dict[str, float]]
     frames: list[int]
@@ -37,7 +36,7 @@ class FitReport(TypedDict):
 
 
 class ChosenSetting(TypedDict):
-    """A setting that was chosen from the scene, and why."""
+    """A setting whose value was chosen from the scene, and the reason."""
 
     setting: str
     value: Any
@@ -45,8 +44,9 @@ class ChosenSetting(TypedDict):
 
 
 class TrainingReport(TypedDict):
-    """report.json of training. seconds: of the steps of both phases, field_seconds: of the field's own; setup_seconds:
-    of what comes before them, and in neither; the mean changes are those of all poses since the fit."""
+    """report.json of training. seconds: duration of the steps of both phases; field_seconds: of the field's own steps;
+    setup_seconds: of the preparation before the first step, included in neither. mean_turn_deg, mean_move_mm: mean
+    change of all poses since the body fit."""
 
     device: str
     processes: int
@@ -64,7 +64,8 @@ class TrainingReport(TypedDict):
 
 class ImageScores(TypedDict):
     """Scores of one image against the truth (docs/method.md, "Evaluation protocol"), in dB or from 0 to 1. lpips: null
-    without its weights. The distances from training are in scores.json alone."""
+    if its weights are missing. view_angle_deg, pose_distance_deg: distances from the training data, only in
+    scores.json."""
 
     camera: str
     frame: int
@@ -79,9 +80,9 @@ class ImageScores(TypedDict):
 
 
 class SurfaceScores(TypedDict):
-    """Scores of one surface against the true one. chamfer_l2_e3: mean squared distance of both directions, m^2 x 1e3;
-    chamfer_mm: mean distance; normal_consistency: mean |cos| of the normals at nearest points; iou of the volumes;
-    watertight: whether the prediction is closed."""
+    """Scores of one surface against the true one. chamfer_l2_e3: mean squared distance over both directions, m^2 x 1e3;
+    chamfer_mm: mean distance; normal_consistency: mean |cos| between normals at nearest points; iou: of the volumes;
+    watertight: whether the predicted surface is closed."""
 
     frame: int
     chamfer_l2_e3: float
@@ -93,7 +94,7 @@ class SurfaceScores(TypedDict):
 
 
 class GeometryScores(TypedDict):
-    """Means over n surfaces. watertight: the share of closed ones."""
+    """Means over n surfaces. watertight: fraction of closed surfaces."""
 
     chamfer_l2_e3: float
     chamfer_mm: float
@@ -105,8 +106,9 @@ class GeometryScores(TypedDict):
 
 
 class SplitMeans(TypedDict):
-    """Means over the n images of a split, null where there are none, for a reason. reference: what was compared with;
-    without_mask, without_person: images that were left out; geometry: of splits that are meshed."""
+    """Means over the n images of a split; null if there are none, and `reason` says why. reference: what the renderings
+    were compared with. without_mask, without_person: number of images left out for lack of a mask, or of the person.
+    geometry: only for splits that are meshed."""
 
     n: int
     psnr: float | None
@@ -124,13 +126,14 @@ class SplitMeans(TypedDict):
 
 
 class SplitScores(SplitMeans):
-    """Scores of a split and of its images."""
+    """Mean scores of a split and the scores of each image."""
 
     per_image: list[ImageScores]
 
 
 class HeldOutCamera(TypedDict):
-    """Scores of a camera that was left out of fit and training; camera: only in holdout.json, which has it alone."""
+    """Scores of a camera that was left out of the fit and of training. camera: its name, only in holdout.json, which
+    scores a single camera."""
 
     camera: NotRequired[str]
     trained_on: list[str]
@@ -139,7 +142,7 @@ class HeldOutCamera(TypedDict):
 
 
 class HeldOut(TypedDict):
-    """Scores by camera left out, and by split their means over cameras."""
+    """Scores of each held-out camera, and their mean over cameras for each split."""
 
     what: str
     cameras: dict[str, HeldOutCamera]
@@ -147,7 +150,8 @@ class HeldOut(TypedDict):
 
 
 class Metrics(TypedDict):
-    """metrics.json of evaluation. lpips: the network's weights, or why there are none; seconds: by part."""
+    """metrics.json of evaluation. lpips: which network weights were used, or why there are none. seconds: duration of
+    each part."""
 
     protocol: str
     lpips: str
@@ -162,7 +166,8 @@ class Metrics(TypedDict):
 
 
 class Machine(TypedDict):
-    """The machine that measurements were taken on. threads: that torch uses; gpu: null without one."""
+    """The machine that measurements were taken on. threads: number of threads that torch uses; gpu: null without a
+    GPU."""
 
     cpu: str
     cores: int
@@ -173,29 +178,29 @@ class Machine(TypedDict):
 
 
 class CurvePoint(SplitMeans):
-    """Scores after some seconds of training."""
+    """Scores after a number of seconds of training."""
 
     seconds: float
 
 
 class Picture(TypedDict):
-    """A scored image of which there is a picture."""
+    """A scored image whose rendering is kept as a picture."""
 
     camera: str
     frame: int
 
 
 class EndScores(TypedDict):
-    """scores.json of a training of which only the end is scored. training: its report.json, which was
-    checked when it was written."""
+    """scores.json of a training run that is scored only at its end. training: its report.json, which was checked when
+    it was written."""
 
     training: dict[str, Any]
     curve: list[CurvePoint]
 
 
 class Scores(EndScores):
-    """scores.json of a benchmark's training. split: of the curve and the pictures; frame_seconds: of rendering, by the
-    image's longest side in pixels."""
+    """scores.json of a benchmark's training run. split: the split of the curve and the pictures. frame_seconds:
+    rendering time of one frame, by the image's longest side in pixels."""
 
     machine: Machine
     protocol: str
@@ -219,13 +224,13 @@ FILES: dict[str, Any] = {
 
 
 def _closed(kind: Any) -> TypeAdapter[Any]:
-    """Return a validator of a kind of result that allows no other keys, in it or in its parts."""
+    """Return a validator of a kind of result that forbids other keys, also in nested parts."""
     return TypeAdapter(with_config(ConfigDict(extra="forbid"))(kind))
 
 
 def write_result(path: Path, kind: Any, result: Any) -> None:
-    """Write a result as JSON. Raises ValidationError if it has a key that its kind lacks, or a value of another
-    type."""
+    """Write a result as JSON. Raise ValidationError if it has a key that its kind does not define, or a value of
+    another type."""
     _closed(kind).validate_python(result)
     path.write_text(json.dumps(result, indent=1))
 
@@ -238,7 +243,7 @@ def write_schemas(folder: Path) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Write the schemas into the folder that the command line names."""
+    """Write the schemas to the folder given on the command line."""
     parser = argparse.ArgumentParser(prog="python -m hnerf.results", description="Write a JSON schema of each result.")
     parser.add_argument("folder", type=Path, help="where to, like docs/schemas")
     write_schemas(parser.parse_args(argv).folder)

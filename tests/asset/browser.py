@@ -1,4 +1,4 @@
-"""Chromium without a window, driven through a pipe by its DevTools protocol, so that no package drives it."""
+"""Headless Chromium, driven over a pipe with its DevTools protocol, so that no driver package is needed."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from typing import Any
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = (
     "--headless",
-    "--no-sandbox",  # root has none
+    "--no-sandbox",  # the sandbox does not work as root
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--disable-background-networking",
@@ -28,7 +28,7 @@ LIMIT_S = 60.0
 
 
 def found_browser() -> str | None:
-    """Return the path of a browser, None if there is none."""
+    """Return the path of an installed browser, or None."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
@@ -63,19 +63,19 @@ class Page:
         return json.loads(message)
 
     def attach(self) -> None:
-        """Make a tab that reports requests, messages and errors."""
+        """Open a tab and enable reports of requests, messages and errors."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Network", "Runtime", "Log"):
             self.call(f"{domain}.enable")
 
     def open(self, path: Path, width: int, height: int) -> None:
-        """Open a file in a window of that size."""
+        """Open a file in a window of the given size."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Page.navigate", url=path.resolve().as_uri())
 
     def evaluate(self, expression: str) -> Any:
-        """Return the value of an expression of JavaScript, awaited."""
+        """Return the value of a JavaScript expression; await it if it is a promise."""
         result = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
@@ -109,7 +109,7 @@ class Page:
         ]
 
     def requests(self) -> list[str]:
-        """Return the addresses that the page asked for."""
+        """Return the addresses that the page requested."""
         sent = [e["params"]["request"]["url"] for e in self.events if e["method"] == "Network.requestWillBeSent"]
         return [url for url in sent if not url.startswith(("data:", "blob:"))]
 
@@ -119,7 +119,7 @@ def browser(program: str) -> Iterator[Page]:
     """Start the browser with an empty profile; yield a page; end the browser."""
     to_browser, from_browser = os.pipe(), os.pipe()
 
-    def as_three_and_four() -> None:  # where the browser expects its pipe
+    def move_pipe_to_3_and_4() -> None:  # the file descriptors where the browser expects its pipe
         reads, writes = os.dup(to_browser[0]), os.dup(from_browser[1])
         os.dup2(reads, 3)
         os.dup2(writes, 4)
@@ -127,7 +127,7 @@ def browser(program: str) -> Iterator[Page]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [program, *OPTIONS, f"--user-data-dir={profile}"],
-            preexec_fn=as_three_and_four,
+            preexec_fn=move_pipe_to_3_and_4,
             close_fds=False,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -16,8 +16,9 @@ from tests.asset.figure import INFO, bending_body, posed_with_displacements, sid
 
 @pytest.fixture(scope="session")
 def staged() -> StagedAvatar:
-    """Return clothes around the bending column, of 816 and of 400 faces, with two shapes of noise, a frown of
-    its top, a stout physique, textures and a normal map of noise, and light from above."""
+    """Return a staged avatar: clothes around the bending column, with levels of 816 and 400 faces, two correctives of
+    random noise, an expression that moves its top (`frown`), a physique (`stout`), textures and a normal map of noise,
+    and light from above."""
     body = bending_body()
     clothes = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(clothes.vertices, clothes.faces, 64)
@@ -50,8 +51,8 @@ def staged() -> StagedAvatar:
 
 @pytest.fixture(scope="session")
 def captured(staged: StagedAvatar) -> StagedAvatar:
-    """Return these clothes a fifth wider, in boxes twice as large, in other colours and another light, at full detail
-    alone, without frown and physique."""
+    """Return the staged avatar with clothes a fifth wider, bounding boxes twice as large, other colours and another
+    light, only at full detail and without expression and physique."""
     assert staged.albedo is not None and staged.normal_map is not None
     return dataclasses.replace(
         staged,
@@ -68,7 +69,7 @@ def captured(staged: StagedAvatar) -> StagedAvatar:
 
 @pytest.fixture(scope="session")
 def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the files of `write_all`, for tests that change none."""
+    """Return a folder with the files of `write_all`, for tests that do not modify it."""
     out = tmp_path_factory.mktemp("package")
     write_all(out, staged)
     return out
@@ -76,7 +77,7 @@ def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture(scope="session")
 def both(staged: StagedAvatar, captured: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the package and `avatar.usdz` of two topologies, for tests that change neither."""
+    """Return a folder with the package and `avatar.usdz` of two topologies, for tests that do not modify it."""
     out = tmp_path_factory.mktemp("both")
     write_package(out, {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
     write_usdz(out / "avatar.usdz", {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)

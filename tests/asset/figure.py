@@ -1,4 +1,4 @@
-"""A two-bone column 1.6 m tall as a body, small enough to work out by hand."""
+"""A body for tests of the asset: a two-bone column 1.6 m tall, small enough to work out results by hand."""
 
 import dataclasses
 import math
@@ -21,8 +21,8 @@ INFO = AssetInfo("column", "7", "CC0-1.0", "0123abcd")
 
 
 def column_rig() -> Rig:
-    """Return a column of radius 15 cm, z from 0 to 1.6 m; joints at z = 0 and z = 0.8; the upper's weight rises from z
-    = 0.7 to 0.9."""
+    """Return a column of radius 15 cm, z from 0 to 1.6 m, with joints at z = 0 and z = 0.8. The upper joint's skinning
+    weight rises from 0 at z = 0.7 to 1 at z = 0.9."""
     column = upright_column(0.15, 0.0, 1.6)
     vertices_m = torch.from_numpy(column.vertices).float()
     faces, joints_m = torch.from_numpy(column.faces).long(), torch.tensor([[0.0, 0, 0], [0, 0, 0.8]])
@@ -30,19 +30,19 @@ def column_rig() -> Rig:
 
 
 def upright_column(radius_m: float, bottom_m: float, top_m: float, storeys: int = 16) -> trimesh.Trimesh:
-    """Return a closed column around the z axis, in storeys of 24 sides."""
+    """Return a closed column around the z axis: a stack of `storeys` rings with 24 sides each."""
     rings = [[radius_m, z] for z in np.linspace(bottom_m, top_m, storeys + 1)]
     return trimesh.creation.revolve([[0, bottom_m], *rings, [0, top_m]], sections=24)
 
 
 def twice(mesh: trimesh.Trimesh, apart_m: tuple[float, float, float]) -> trimesh.Trimesh:
-    """Return a mesh and its copy beside it as one mesh."""
+    """Return one mesh that contains a mesh and a copy of it shifted by `apart_m`."""
     vertices_m = np.concatenate([mesh.vertices, mesh.vertices + apart_m])
     return trimesh.Trimesh(vertices_m, np.concatenate([mesh.faces, mesh.faces + len(mesh.vertices)]), process=False)
 
 
 def upper_weight(z_m: torch.Tensor) -> torch.Tensor:
-    """Return the upper bone's skin weight at a height."""
+    """Return the upper bone's skinning weight at given heights."""
     return ((z_m - 0.7) / 0.2).clamp(0, 1)
 
 
@@ -65,12 +65,12 @@ def posed_with_displacements(clothed: BodyFit, moved_m: np.ndarray) -> np.ndarra
 
 
 def no_cavities(clothed: BodyFit) -> np.ndarray:
-    """Return that no vertex lines a cavity."""
+    """Return a mask (V,) bool that marks no vertex as lining a cavity."""
     return np.zeros(len(clothed.rig.vertices_m), bool)
 
 
 def side_camera() -> Camera:
-    """Return a camera 3 m from the origin along -y of the world, looking along +y; the image's right is +x."""
+    """Return a camera at (0, -3, 1) m that looks along +y of the world; the image's right is +x."""
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     K = np.array([[500.0, 0, 300], [0, 400, 200], [0, 0, 1]])
     return Camera("01", K, R, -R @ np.array([0, -3.0, 1.0]), 640, 480)

@@ -1,4 +1,4 @@
-"""The bending column's glTF file, as the viewer gets it."""
+"""The bending column's glTF file, as passed to the viewer."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ def write_avatar(path: Path, avatar: StagedAvatar) -> None:
 
 
 def with_joints_in_second_set(glb: bytes) -> bytes:
-    """Return the file with four influences of weight zero before those of each vertex."""
+    """Return the file with four zero-weight influences inserted before those of each vertex."""
     document, binary = read_glb(glb)
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     for name in ("JOINTS", "WEIGHTS"):

@@ -1,4 +1,4 @@
-"""An avatar without a network: the body grown by a centimetre, coloured by position on the rest body."""
+"""An avatar without a network: the body's surface 1 cm farther out, coloured by position on the rest body."""
 
 from dataclasses import dataclass, field
 

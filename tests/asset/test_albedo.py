@@ -1,4 +1,4 @@
-"""Albedos of texels worked out by hand, in a light that comes from above."""
+"""Albedos of texels, worked out by hand, under light from above."""
 
 import numpy as np
 import torch
@@ -15,27 +15,28 @@ ALBEDO = np.array([[0.8, 0.4, 0.2]])
 
 
 def seen(normal: np.ndarray, colours: np.ndarray) -> SeenTexels:
-    """Return what a photograph from along the normal shows of the first texel."""
+    """Return what a photograph taken along the normal shows of the first texel."""
     return SeenTexels(TexelPixels(np.array([0]), np.array([0]), colours), np.ones(1), normal[None], colours)
 
 
-def test_irradiances_by_hand() -> None:
+def test_irradiance_of_light_from_above_by_hand() -> None:
     np.testing.assert_allclose(ABOVE.irradiance(np.stack([UP, SIDE, DOWN])), [1, 0.6, 0.2], atol=1e-12)
 
 
-def test_light_of_any_side_goes_out() -> None:
-    """The same albedo, photographed in light, in half-light and in the shade, comes out; not so at one normal for
-    all."""
+def test_albedo_is_recovered_from_any_illumination() -> None:
+    """The same albedo, photographed in full light, half-light and shade, is recovered because each photograph has its
+    own normal."""
     blend = AlbedoBlend(to_srgb(0.6 * ALBEDO), np.array([0.6]), ABOVE)
     for normal, irradiance in ((UP, 1.0), (SIDE, 0.6), (DOWN, 0.2)):
         blend.add(seen(normal, to_srgb(irradiance * ALBEDO)))
     np.testing.assert_allclose(to_linear(blend.colours()), ALBEDO, atol=1e-9)
 
 
-def test_views_weigh_as_their_light() -> None:
-    """Albedos 0.5 in full light and 0.52 in 0.2 of it, beside the field's 0.5, which it saw in half-light, about (0.5 +
-    0.2 x 0.52 + FIELD_WEIGHT x 0.25) / (1.2 + FIELD_WEIGHT / 2): the second contradicts the field by 0.007 sqrt(3),
-    less than a tenth of 0.15, and counts as a whole to a hundredth."""
+def test_views_are_weighted_by_their_irradiance() -> None:
+    """Two views and the field are averaged. One view has albedo 0.5 in full light, one 0.52 at irradiance 0.2; the
+    field has 0.5, seen in half-light. Their mean is about (0.5 + 0.2 x 0.52 + FIELD_WEIGHT x 0.25) / (1.2 +
+    FIELD_WEIGHT / 2): the second view differs from the field by 0.007 sqrt(3), less than a tenth of 0.15, so its weight
+    is reduced by at most a hundredth."""
     blend = AlbedoBlend(np.full((1, 3), to_srgb(np.array(0.25))), np.array([0.5]), ABOVE)
     blend.add(seen(UP, np.full((1, 3), to_srgb(np.array(0.5)))))
     blend.add(seen(DOWN, np.full((1, 3), to_srgb(np.array(0.104)))))
@@ -57,9 +58,9 @@ def test_irradiance_is_the_mean_over_surfaces() -> None:
     np.testing.assert_allclose(found, [(1 + 0.2) / 2], atol=1e-6)
 
 
-def test_irradiance_between_two_normals_is_that_of_a_unit_vector() -> None:
-    """A roof's edge has a normal half-way between up and +X; half-way from there to a corner that faces up, it is at
-    22.5 degrees, where E = 0.6 + 0.4 cos."""
+def test_irradiance_uses_normalised_interpolated_normals() -> None:
+    """The ridge of a roof has a normal half-way between up and +X. Half-way from the ridge to a corner that faces up,
+    the normal is tilted by 22.5 degrees, where E = 0.6 + 0.4 cos."""
     corners_m = np.array([[-1.0, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1]])
     place = torch.zeros(1, dtype=torch.long)
     texels = Texels(place, place, place, torch.tensor([[0.5, 0.25, 0.25]]))

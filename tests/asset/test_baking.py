@@ -1,4 +1,4 @@
-"""Textures of the bending column from pictures of it: one grey, lit from the left, while it turns."""
+"""Textures of the bending column, baked from images of it: uniformly grey, lit from the left, while it turns."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class Grey(StandInAvatar):
 
 @pytest.fixture(scope="module")
 def pictures() -> dict[int, np.ndarray]:
-    """Return a picture of the column in each frame."""
+    """Return an image of the column in each frame."""
     body, camera, found = figure.bending_body(), figure.side_camera(), {}
     x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     for frame, theta, root in zip(body.frames, body.theta, body.root, strict=True):
@@ -59,7 +59,7 @@ class Pictured(Capture):
 
 
 def test_the_albedo_of_a_grey_column_is_one_grey(pictures: dict[int, np.ndarray]) -> None:
-    """Where it is brightest, E is 1."""
+    """The light is scaled so that E is 1 at the brightest point."""
     body = figure.bending_body()
     still_m = np.zeros((len(body.frames), *body.rig.vertices_m.shape), np.float32)
     surfaces_m = figure.posed_with_displacements(body, still_m).astype(float)
@@ -85,7 +85,7 @@ def test_there_is_no_albedo_without_photographs() -> None:
 
 
 def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
-    """The upper half of the column is declared a cavity."""
+    """The upper half of the column is marked as a cavity."""
     body = figure.bending_body()
     vertices_m, faces = body.rig.vertices_m.numpy(), body.rig.faces.numpy()
     still_m = np.zeros((len(body.frames), *vertices_m.shape), np.float32)

@@ -12,7 +12,7 @@ from tests.asset.figure import FRAMES
 
 
 def with_axes(staged: StagedAvatar, axes: np.ndarray) -> StagedAvatar:
-    """Return the avatar with the axes of all joints of its game rig turned, whatever they were."""
+    """Return the avatar with the axes of all joints of its game rig rotated."""
     game, turn = staged.rigs["game"], np.eye(4)
     turn[:3, :3] = axes
     skeleton = dataclasses.replace(game.skeleton, rotations=game.skeleton.rotations @ axes)
@@ -23,9 +23,9 @@ def with_axes(staged: StagedAvatar, axes: np.ndarray) -> StagedAvatar:
 
 
 @pytest.mark.parametrize("axes", [np.eye(3), Rotation.from_euler("zx", [40, 90], degrees=True).as_matrix()])
-def test_the_captured_motion_in_centimetres(axes: np.ndarray, staged: StagedAvatar, tmp_path: Path) -> None:
-    """At 30 a second, frames 3 to 8 of 10 a second are rows 0 to 15. In frame f the pelvis is at (0.1 f, 2, 0.5) of a
-    world with Z up, and the upper joint, 80 cm above it, has turned by 0.1 f about x."""
+def test_bvh_holds_the_captured_motion_in_centimetres(axes: np.ndarray, staged: StagedAvatar, tmp_path: Path) -> None:
+    """At 30 frames a second, the captured frames 3 to 8, at 10 a second, are rows 0 to 15. In frame f the pelvis is at
+    (0.1 f, 2, 0.5) of a world with Z up, and the upper joint, 80 cm above it, has turned by 0.1 f about x."""
     write_avatar_bvh(tmp_path / "avatar.bvh", with_axes(staged, axes))
     file = read_bvh(tmp_path / "avatar.bvh")
     assert (file.names, file.parents.tolist(), len(file.positions)) == (("Hips", "upper_L"), [-1, 0], 16)
@@ -37,5 +37,5 @@ def test_the_captured_motion_in_centimetres(axes: np.ndarray, staged: StagedAvat
         np.testing.assert_allclose(at[row], [[10 * frame, 50, -200], [10 * frame, 130, -200]], atol=1e-4)
         c, s = np.cos(0.1 * frame), np.sin(0.1 * frame)
         np.testing.assert_allclose(file.rotations[row, 1], [[1, 0, 0], [0, c, -s], [0, s, c]], atol=1e-6)
-        heading = [np.sin(0.8 * frame), 0, np.cos(0.8 * frame)]  # of what faces +Z at rest
+        heading = [np.sin(0.8 * frame), 0, np.cos(0.8 * frame)]  # where the axis that faces +Z at rest points
         np.testing.assert_allclose(turns[row, 0] @ [0, 0, 1], heading, atol=1e-6)

@@ -11,8 +11,8 @@ from tests.asset.pages import write_avatar
 from tests.asset.test_glb import accessor
 
 
-def test_only_the_texture_and_blend_shapes_change(staged: StagedAvatar, tmp_path: Path) -> None:
-    """Blend shapes by at most half a step: 1 / 65 536 m, and 1 / 256 of normals."""
+def test_compacting_changes_only_the_texture_and_blend_shapes(staged: StagedAvatar, tmp_path: Path) -> None:
+    """Blend shapes change by at most half a quantisation step: 1 / 65 536 m, and 1 / 256 for normals."""
     write_avatar(tmp_path / "avatar.glb", staged)
     (tmp_path / "compact.glb").write_bytes(compact_glb((tmp_path / "avatar.glb").read_bytes(), 32))
     before, after = (pygltflib.GLTF2.load(str(tmp_path / name)) for name in ("avatar.glb", "compact.glb"))

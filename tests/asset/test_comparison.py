@@ -29,7 +29,7 @@ WHOLE = (slice(120, 270), slice(250, 400))  # rows and columns of the mask: 150 
 
 
 class GreyField(StandInAvatar):
-    """A field that shows one grey wherever a pixel is."""
+    """A field that renders the same grey at every pixel."""
 
     level = 90
 
@@ -40,7 +40,7 @@ class GreyField(StandInAvatar):
 
 @pytest.fixture
 def recorded(tmp_path: Path) -> Capture:
-    """Return a capture whose photographs are grey all over."""
+    """Return a capture whose photographs are uniformly grey."""
     found = dataclasses.replace(capture(), root=tmp_path)
     for frame in found.train_frames:
         write_image(tmp_path / f"images/01/{frame:06d}.png", np.full((480, 640, 3), PERSON, np.uint8))
@@ -64,14 +64,14 @@ def grey(staged: StagedAvatar, level: int) -> StagedAvatar:
 def test_the_field_is_scored_under_the_mask_in_its_padded_box(recorded: Capture, staged: StagedAvatar) -> None:
     (found,) = compare_with_field(recorded, masks_of((4,)), GreyField(bending_body()), grey(staged, 100))
     assert (found.view.camera, found.view.frame, found.photograph.shape) == ("01", 4, (190, 190, 3))
-    # The field shows 90 all over: 20 too dark on the mask, 90 too bright on the 20 px around it.
+    # The field shows 90 everywhere: 20 too dark inside the mask, 90 too bright in the 20 px around it.
     inside = 150**2 / 190**2
     error = inside * (20 / 255) ** 2 + (1 - inside) * (90 / 255) ** 2
     assert found.scores["field"]["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
     assert found.scores["field"]["mask_iou"] == pytest.approx(inside)
 
 
-def test_the_asset_is_seen_by_the_camera_in_the_frame_as_that_camera_exposes_it(
+def test_the_asset_is_rendered_with_pose_and_exposure_of_camera_and_frame(
     recorded: Capture, staged: StagedAvatar
 ) -> None:
     avatar = GreyField(bending_body(), gains={"01": (0.5, 1.0, 3.0)})
@@ -79,16 +79,16 @@ def test_the_asset_is_seen_by_the_camera_in_the_frame_as_that_camera_exposes_it(
     points_m = staged.points_m[list(staged.frames).index(4)] @ staged.stage_from_world
     seen_px, _ = side_camera().project(points_m)
     covered = np.argwhere(found.renders["asset"][..., 3] > 127)[:, ::-1]
-    # One-centimetre noise on single points is 1 px.
-    np.testing.assert_allclose(covered.min(0), seen_px.min(0) - (230, 100), atol=3)  # where the box begins
+    # Single points have noise of 1 cm, which is 1 px.
+    np.testing.assert_allclose(covered.min(0), seen_px.min(0) - (230, 100), atol=3)  # the box's upper left corner
     np.testing.assert_allclose(covered.max(0), seen_px.max(0) - (230, 100), atol=3)
     column, row = covered.mean(0).astype(int)
     assert found.renders["asset"][row, column].tolist() == [50, 100, 255, 255]
 
 
-def test_the_albedo_is_seen_in_its_light_as_the_camera_exposes_it(recorded: Capture, staged: StagedAvatar) -> None:
-    light = Light(np.array([0.5, 0, -0.3, 0, 0, 0, 0, 0, 0]), 20.0)  # a half, and less from +Z of the stage
-    albedo = Albedo(np.full((64, 64, 3), 188, np.uint8), light)  # a half in linear light
+def test_the_albedo_is_rendered_in_its_light_with_the_cameras_exposure(recorded: Capture, staged: StagedAvatar) -> None:
+    light = Light(np.array([0.5, 0, -0.3, 0, 0, 0, 0, 0, 0]), 20.0)  # one half on average, less from +Z of the stage
+    albedo = Albedo(np.full((64, 64, 3), 188, np.uint8), light)  # 0.5 in linear light
     avatar = GreyField(bending_body(), gains={"01": (0.5, 1.0, 1.2)})
     (found,) = compare_with_field(recorded, masks_of((4,)), avatar, dataclasses.replace(staged, albedo=albedo))
     points_m = staged.points_m[list(staged.frames).index(4)] @ staged.stage_from_world
@@ -100,12 +100,12 @@ def test_the_albedo_is_seen_in_its_light_as_the_camera_exposes_it(recorded: Capt
     linear = 0.5 * (0.5 + 2 / 3 * -0.3 * 3**0.5 * (staged.stage_from_world @ normal)[2] / np.linalg.norm(normal))
     expected = 255 * (1.055 * linear ** (1 / 2.4) - 0.055) * np.array([0.5, 1.0, 1.2])
     np.testing.assert_allclose(shown[row, column, :3], expected, atol=6)
-    assert expected[1] < 130  # unlike the albedo itself
+    assert expected[1] < 130  # darker than the unlit albedo
     both = {"asset", "albedo", "field"}
     assert both == found.scores.keys() and both < comparison_figures([found]).keys()
 
 
-def test_splats_are_seen_as_the_asset_is_and_scored_by_photograph_and_field(
+def test_splats_look_like_the_asset_and_are_scored_against_photograph_and_field(
     recorded: Capture, staged: StagedAvatar
 ) -> None:
     avatar, shown = GreyField(bending_body(), gains={"01": (0.5, 1.0, 3.0)}), grey(staged, 100)
@@ -113,7 +113,7 @@ def test_splats_are_seen_as_the_asset_is_and_scored_by_photograph_and_field(
     inside = found.renders["asset"][..., 3] == 255
     assert np.abs(found.renders["splats"][inside].astype(int) - (50, 100, 255, 255)).mean() < 3
     assert found.scores["splats"]["psnr"] == pytest.approx(found.scores["asset"]["psnr"], abs=0.5)
-    off = (found.renders["splats"][..., :3].astype(float) - 90) / 255  # the field is grey all over
+    off = (found.renders["splats"][..., :3].astype(float) - 90) / 255  # the field is uniformly grey
     assert found.scores["splats"]["psnr_to_field"] == pytest.approx(-10 * np.log10((off**2).mean()), abs=1e-3)
     figures = comparison_figures([found])
     assert figures["splats"] == found.scores["splats"] and list(figures["below_field"]) == ["psnr", "ssim", "mask_iou"]
@@ -129,10 +129,10 @@ def test_large_boxes_are_scaled_down(recorded: Capture, staged: StagedAvatar, mo
     assert (found.renders["asset"][..., 3] > 127).sum() == pytest.approx(18 * 68, rel=0.1)
 
 
-def test_a_sliver_of_a_person_is_scored(
+def test_a_person_cut_to_a_narrow_strip_is_scored(
     recorded: Capture, staged: StagedAvatar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its box, 28 px wide and 470 high, would be 9 px wide at 150."""
+    """The box is 28 px wide and 470 px high; scaled to a longest side of 150 px it would be 9 px wide."""
     monkeypatch.setattr(comparison, "LONGEST_PX", 150)
     edge = np.zeros((480, 640), bool)
     edge[:450, :8] = True
@@ -155,8 +155,8 @@ def test_test_cameras_with_masks_come_first(recorded: Capture, staged: StagedAva
     assert comparison_figures(found)["cameras"] == "test"
 
 
-def test_views_are_drawn_from_those_with_a_mask(recorded: Capture, staged: StagedAvatar) -> None:
-    """Of three test cameras, only the last has masks."""
+def test_views_are_chosen_among_those_with_a_mask(recorded: Capture, staged: StagedAvatar) -> None:
+    """Only the last of three test cameras has masks."""
     further = {name: dataclasses.replace(side_camera(), name=name) for name in ("02", "03", "04")}
     tested = dataclasses.replace(recorded, cameras=recorded.cameras | further, test_cameras=tuple(further))
     for frame in recorded.train_frames:
@@ -166,7 +166,7 @@ def test_views_are_drawn_from_those_with_a_mask(recorded: Capture, staged: Stage
     assert [(c.view.camera, c.view.frame) for c in found] == [("04", frame) for frame in recorded.train_frames]
 
 
-def test_without_a_mask_there_is_a_reason_and_no_refusal(recorded: Capture, staged: StagedAvatar) -> None:
+def test_without_any_mask_a_reason_is_given_and_the_export_passes(recorded: Capture, staged: StagedAvatar) -> None:
     nobody = Masks({("01", 3): encode(np.zeros((480, 640), bool))}, {})
     for masks in (nobody, Masks({}, {})):
         figures = comparison_figures(compare_with_field(recorded, masks, GreyField(bending_body()), staged))
@@ -174,7 +174,7 @@ def test_without_a_mask_there_is_a_reason_and_no_refusal(recorded: Capture, stag
         require_close("ada", "registered", figures, allow_poor=False)
 
 
-def test_figures_are_means_and_what_the_asset_lacks(recorded: Capture, staged: StagedAvatar) -> None:
+def test_figures_are_means_and_the_assets_deficit_below_the_field(recorded: Capture, staged: StagedAvatar) -> None:
     (one,) = compare_with_field(recorded, masks_of((4,)), GreyField(bending_body()), staged)
     scored = [
         dataclasses.replace(one, scores={"asset": {"psnr": a, "ssim": 0.9}, "field": {"psnr": f, "ssim": 0.95}})
@@ -206,7 +206,7 @@ def test_an_asset_far_below_its_field_is_refused_in_one_line(caplog: pytest.LogC
     assert "ada: the asset with the registered mesh is below its field: captured look 4.1 dB" in caplog.text
 
 
-def test_one_good_look_is_enough_and_the_other_is_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_one_good_look_is_enough_and_a_poor_one_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     def figures(captured_db: float, albedo_db: float) -> dict[str, Any]:
         psnr = {"asset": 29.5 - captured_db, "albedo": 29.5 - albedo_db, "field": 29.5}
         return {"images": 6, "cameras": "test"} | {shown: {"psnr": value} for shown, value in psnr.items()}

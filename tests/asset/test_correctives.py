@@ -10,13 +10,14 @@ from tests.asset.figure import bending_body, posed_with_displacements, upright_c
 from tests.asset.stand_in import StandInAvatar
 
 
-def test_steps_fade_beyond_half_of_the_longest() -> None:
+def test_steps_to_the_surface_fade_to_zero_beyond_half_the_longest() -> None:
     steps_m = step_to_surface(torch.tensor([0.01, -0.015, 0.0225, 0.03, 0.2]))
     torch.testing.assert_close(steps_m, torch.tensor([0.01, -0.015, 0.01125, 0.0, 0.0]))
 
 
-def test_the_skinned_surface_is_moved_onto_the_fields_in_the_rest_pose() -> None:
-    """Clothes of 17 cm around a field of 16: a centimetre inwards on the sides, in every pose, away from the joint."""
+def test_the_skinned_surface_is_moved_onto_the_fields_surface() -> None:
+    """Clothes of radius 17 cm around a field of radius 16 cm: in every pose the sides move 1 cm inwards in rest
+    coordinates, away from the joint."""
     body, clothes = bending_body(), upright_column(0.17, -0.02, 1.62)
     clothed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
     _, moved_m = frame_surfaces(StandInAvatar(body), clothed)
@@ -28,7 +29,7 @@ def test_the_skinned_surface_is_moved_onto_the_fields_in_the_rest_pose() -> None
         np.testing.assert_allclose(frame[sides], inwards, atol=0.0015)
 
 
-def test_displacements_are_turned_by_the_skinning() -> None:
+def test_displacements_are_in_rest_coordinates_and_turned_by_skinning() -> None:
     body, clothes = bending_body(), upright_column(0.17, -0.02, 1.62)
     clothed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
     surfaces_m, moved_m = frame_surfaces(StandInAvatar(body), clothed)
@@ -36,8 +37,8 @@ def test_displacements_are_turned_by_the_skinning() -> None:
     np.testing.assert_allclose(posed_with_displacements(clothed, moved_m), surfaces_m, atol=1e-6)
 
 
-def test_surfaces_follow_what_a_frame_slides_along_them() -> None:
-    """In the last frame, bent, the field's column slides a centimetre up itself, along the surface."""
+def test_surfaces_follow_displacements_along_the_surface() -> None:
+    """In the last frame, which is bent, the field's column slides 1 cm upwards along its own surface."""
 
     class Sliding(StandInAvatar):
         def frame_displacements(self, points_m: torch.Tensor, theta: torch.Tensor, root: torch.Tensor) -> torch.Tensor:
@@ -56,13 +57,13 @@ def test_surfaces_follow_what_a_frame_slides_along_them() -> None:
 
 
 def rebuilt(found: Correctives) -> np.ndarray:
-    """Return the displacements (n, V, 3) that shapes and weights stand for."""
+    """Return the displacements (n, V, 3) that blend shapes and weights reproduce."""
     return np.einsum("nk,kvd->nvd", found.weights, found.offsets_m)
 
 
-def test_displacements_that_are_multiples_of_a_shape_by_hand() -> None:
-    """The largest, -2, has weight 1 of its shape; the other sign, 1, is half of the opposite shape, whose greatest
-    weight is then 1."""
+def test_displacements_of_both_signs_become_two_opposite_shapes() -> None:
+    """The displacements are 1, -2 and 0 times one shape. The largest, -2, becomes a blend shape with weight 1. The
+    other sign, 1, becomes the opposite shape, scaled so that its greatest weight is 1 too."""
     shape_m = np.array([[0.01, 0, 0], [0, -0.02, 0]])
     found = correctives_of(np.stack([shape_m, -2 * shape_m, 0 * shape_m]).astype(np.float32), 1)
     np.testing.assert_allclose(found.weights, [[0, 1], [1, 0], [0, 0]], atol=1e-6)
@@ -77,8 +78,8 @@ def test_weights_are_from_0_to_1_and_rebuild_all_components() -> None:
     np.testing.assert_allclose(rebuilt(found), moved_m, atol=1e-5)
 
 
-def test_shapes_leave_the_least_squared_displacement() -> None:
-    """Two orthogonal components of 3 and 1 cm; the one that is kept is the larger."""
+def test_shapes_minimise_the_squared_residual_displacement() -> None:
+    """Of two orthogonal components, of 3 and 1 cm, the larger is kept."""
     moved_m = np.array([[[0.03, 0, 0]], [[0, 0.01, 0]]], np.float32)
     np.testing.assert_allclose(rebuilt(correctives_of(moved_m, 1))[:, 0], [[0.03, 0, 0], [0, 0, 0]], atol=1e-7)
     assert correctives_of(moved_m, 8).weights.shape == (2, 3)

@@ -1,4 +1,4 @@
-"""The dome of a light: where it is bright, and that it lights as the light does."""
+"""The dome light: where it is bright, and that it illuminates as the fitted light does."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from tests.asset.test_light import COEFFICIENTS, directions
 SHARPER = np.array([0.4, 0.1, 0.32, 0.12, 0.1, 0.2, 0.25, 0.27, 0.03])  # its radiance is negative in places
 
 
-def test_directions_of_a_latlong_picture() -> None:
-    """Of 2 x 4 pixels, the second column looks 45 degrees left of +Z, towards +X; the upper row 45 degrees up. Its
-    pixels cover as much as the lower's, an eighth each."""
+def test_directions_of_a_latlong_image() -> None:
+    """In an image of 2 x 4 pixels, the second column looks 45 degrees left of +Z, towards +X, and the upper row 45
+    degrees up. All eight pixels cover the same solid angle, an eighth each."""
     found, share = dome_directions(2)
     assert found.shape == (8, 3)
     np.testing.assert_allclose(found[1], [0.5, 0.5**0.5, 0.5], atol=1e-12)
@@ -20,7 +20,7 @@ def test_directions_of_a_latlong_picture() -> None:
     np.testing.assert_allclose(share, 1 / 8)
 
 
-def test_a_dome_lights_as_its_light() -> None:
+def test_a_dome_has_the_irradiance_of_its_light() -> None:
     for coefficients in (COEFFICIENTS, SHARPER, np.eye(9)[0]):
         light = Light(coefficients, 0.0)
         picture, intensity = dome(light)
@@ -37,6 +37,6 @@ def test_a_constant_light_is_one_grey() -> None:
     assert picture.min() >= 250 and abs(intensity - 0.5) < 0.01
 
 
-def test_the_sun_is_where_the_light_is_bright() -> None:
+def test_the_dome_is_brightest_where_the_light_comes_from() -> None:
     picture, _ = dome(Light(np.array([1, 0, 0, 0.5, 0, 0, 0, 0, 0]), 0.0))  # towards +X
     assert picture[HEIGHT_PX // 2, HEIGHT_PX // 2, 0] > 240 > 50 + picture[HEIGHT_PX // 2, 3 * HEIGHT_PX // 2, 0]

@@ -28,13 +28,13 @@ SMALL = AssetSettings(
 
 @pytest.fixture
 def small_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have few and small pictures in reports, and no viewer, for which the capture has no pixels."""
+    """Make reports with few and small images, and without a viewer, because the capture has no pixels."""
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
     monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
     monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))
 
 
-def test_surface_is_the_grown_body() -> None:
+def test_the_surface_is_the_body_plus_clothing_thickness() -> None:
     body = bending_body()
     surface = surface_in_pose(StandInAvatar(body), torch.zeros_like(body.theta[0]), torch.eye(4), SMALL.grid_cells)
     lower_m, upper_m = surface.bounds
@@ -43,8 +43,8 @@ def test_surface_is_the_grown_body() -> None:
 
 
 class Swelling(StandInAvatar):
-    """An avatar whose clothes stand 2 mm higher in frame 3, 4 in 4, 6 in 5 and 12 in 8 than without frames: as the
-    upper bone bends by 0.1 rad a frame."""
+    """An avatar whose clothes stand 2, 4, 6 and 12 mm farther out in frames 3, 4, 5 and 8 than without frames, because
+    the upper bone bends by 0.1 rad a frame."""
 
     def without_frames(self) -> StandInAvatar:
         return StandInAvatar(self.body)
@@ -54,7 +54,7 @@ class Swelling(StandInAvatar):
 
 
 def test_the_mesh_has_the_mean_displacement_of_training_frames() -> None:
-    """4 mm on average over frames 3 to 5, which leaves -2, 0, 2 and, in the novel pose of frame 8, 8 mm."""
+    """The mean over training frames 3 to 5 is 4 mm. It leaves -2, 0 and 2 mm, and 8 mm in the novel pose of frame 8."""
     mesh = _rest_meshes(StandInAvatar(bending_body()), SMALL, {}).by_topology["captured"]
     found = _clothed_surface(capture(), Swelling(bending_body()), mesh, SMALL)
     still = _clothed_surface(capture(), StandInAvatar(bending_body()), mesh, SMALL)
@@ -79,9 +79,9 @@ FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "
 
 
 @pytest.mark.usefixtures("small_report")
-def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frown_m = np.full((len(column_rig().vertices_m), 3), 0.01, np.float32)
-    stout_m = frown_m * np.float32([1, 1, 0])  # its soles stay on the ground
+    stout_m = frown_m * np.float32([1, 1, 0])  # no vertical part, so the soles stay on the ground
     frowning = dataclasses.replace(
         base_mesh(column_rig()), face_units_m={"frown": frown_m}, physiques_m={"stout": stout_m}
     )
@@ -160,7 +160,9 @@ def test_a_motion_that_lacks_a_joint_is_refused_before_anything_is_made(
         export_asset(capture(), Masks({}, {}), StandInAvatar(body), SMALL, tmp_path, "", {"nod": strange})
 
 
-def test_nothing_is_written_of_an_asset_far_below_its_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_written_if_the_asset_is_far_below_its_field(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     poor = {"images": 2, "cameras": "training", "asset": {"psnr": 20.0}, "field": {"psnr": 30.0}}
     monkeypatch.setattr("hnerf.asset.export.comparison_figures", lambda compared: poor)
     tiny = SMALL.model_copy(update={"grid_cells": 32, "texture_px": 32, "faces": 500, "correctives": 0})
@@ -169,7 +171,7 @@ def test_nothing_is_written_of_an_asset_far_below_its_field(tmp_path: Path, monk
     assert list(tmp_path.iterdir()) == []
 
 
-def test_sums_are_rounded_as_on_one_thread_however_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_uses_one_blas_thread_so_results_do_not_depend_on_the_count(monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[int] = []
 
     def stop(*_: object) -> None:

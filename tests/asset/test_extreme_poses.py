@@ -29,7 +29,7 @@ def joints_m(rig: Rig, theta: torch.Tensor | None) -> dict[str, np.ndarray]:
     return dict(zip(rig.joint_names, at, strict=True))
 
 
-def test_turns_are_about_the_axes_of_the_stage_and_mirrored() -> None:
+def test_joint_turns_are_about_stage_axes_and_mirrored_to_the_other_side() -> None:
     arms = dataclasses.replace(column_rig(), joint_names=("upper.R", "upper.L"))
     theta = turned(arms, {"upper.L": (0, 0, 90)})  # about the axis to the front, which is -Y of the body
     assert theta is not None
@@ -37,7 +37,7 @@ def test_turns_are_about_the_axes_of_the_stage_and_mirrored() -> None:
     assert turned(arms, {"lower.L": (0, 0, 90)}) is None
 
 
-def test_the_column_bows_to_the_front(staged: StagedAvatar) -> None:
+def test_a_bent_joint_moves_the_columns_top_to_the_front(staged: StagedAvatar) -> None:
     rig = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))
     upright = posed_m(staged, rig, torch.zeros(2, 3))
     np.testing.assert_allclose(upright - upright[0], staged.rest_points_m - staged.rest_points_m[0], atol=1e-6)
@@ -46,7 +46,7 @@ def test_the_column_bows_to_the_front(staged: StagedAvatar) -> None:
     np.testing.assert_allclose(bowed[top] - upright[top], [0, -0.85, 0.85], atol=1e-4)
 
 
-def test_a_body_without_these_joints_has_no_such_poses(staged: StagedAvatar) -> None:
+def test_a_body_without_the_needed_joints_has_no_extreme_poses(staged: StagedAvatar) -> None:
     faceless = dataclasses.replace(staged, expressions_m={}, physiques_m={})
     assert extreme_poses(faceless, clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65)), 0) == []
 
@@ -73,8 +73,8 @@ def test_expressions_and_physiques_are_shown_with_the_poses(staged: StagedAvatar
     assert shown[-1].shown.all()
 
 
-def test_poses_are_what_their_names_say(rig: Rig) -> None:
-    """In body axes: Z up, to the front -Y, to the left +X."""
+def test_poses_match_their_names(rig: Rig) -> None:
+    """In body axes Z is up, -Y is to the front and +X to the left."""
     up = joints_m(rig, turned(rig, ARMS_UP))
     squat = joints_m(rig, turned(rig, DEEP_SQUAT))
     for side, sign in (("L", 1), ("R", -1)):
@@ -100,6 +100,6 @@ def test_a_fist_brings_finger_ends_to_the_palm(rig: Rig) -> None:
     assert fist(column_rig()) is None
 
 
-def test_vertices_by_the_joint_that_they_follow_most(rig: Rig) -> None:
+def test_moved_by_selects_vertices_by_their_strongest_joint(rig: Rig) -> None:
     hands = rig.vertices_m[moved_by(rig, ("wrist.L", "metacarpal", "finger")).nonzero()[0]]
     assert hands[:, 0].abs().min() > 0.3 and len(hands) > 200

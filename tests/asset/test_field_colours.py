@@ -31,7 +31,7 @@ def test_colours_are_read_on_the_fields_own_surface() -> None:
         assert distance_m.abs().median() < 0.002
 
 
-def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
+def test_baked_colours_match_the_point_on_the_rest_body() -> None:
     body = bending_body()
     clothes = upright_column(0.16, 0.0, 1.6)
     layout = unwrap(clothes.vertices, clothes.faces, 256)
@@ -43,7 +43,7 @@ def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
     middle_uv = layout.uvs[layout.face_uvs].mean(1)
     pixel = image[((1 - middle_uv[:, 1]) * 256).astype(int), (middle_uv[:, 0] * 256).astype(int)]
     middle_m = torch.tensor(clothes.triangles_center).float()
-    # Between the caps, away from the joint, whose bend shears, and off the stripes' borders. The body is 1 cm beneath.
+    # Only between the caps, away from the joint (bending shears) and from borders of stripes. The body is 1 cm inside.
     z_m = middle_m[:, 2]
     sides = (z_m > 0.1) & (z_m < 1.5) & ((z_m - 0.8).abs() > 0.2) & ((z_m % 0.2 - 0.1).abs() < 0.09)
     inward = middle_m[:, :2] * (0.15 / middle_m[:, :2].norm(dim=1, keepdim=True))
@@ -52,8 +52,9 @@ def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
     assert np.abs(pixel[sides.numpy()] / 255 - expected).max() < 0.03
 
 
-def test_texels_off_the_fields_surface_take_the_colour_around() -> None:
-    """Clothes 25 cm taller than the body: above its top, the field's colour there would be lighter than any below."""
+def test_texels_off_the_fields_surface_take_the_surrounding_colour() -> None:
+    """The clothes are 25 cm taller than the body. Above the body's top, the field's colour would be lighter than
+    anywhere below."""
 
     class Height(StandInAvatar):
         def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
@@ -69,8 +70,8 @@ def test_texels_off_the_fields_surface_take_the_colour_around() -> None:
     assert colours[z_m > 1.7].min() > 0.7
 
 
-def test_cavities_take_the_colour_around() -> None:
-    """The upper half of a column is declared a cavity: the lower half is red, and so all of it is."""
+def test_cavities_take_the_surrounding_colour() -> None:
+    """The upper half of a column is marked as a cavity. The lower half is red, and so the whole column becomes red."""
 
     class Halves(StandInAvatar):
         def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
@@ -87,14 +88,15 @@ def test_cavities_take_the_colour_around() -> None:
         np.testing.assert_allclose(np.median(colours[z_m < 0.7], 0), [1, 0, 0], atol=1e-3)
 
 
-def test_median_of_what_is_seen() -> None:
+def test_median_over_the_poses_that_see_a_texel() -> None:
     nan = np.nan
     poses = np.array([[3.0, nan, nan, nan], [1.0, 4.0, 7.0, nan], [2.0, 1.0, nan, nan]])[..., None] * np.ones(3)
     np.testing.assert_array_equal(median_of_seen(poses)[:, 0], [2, 2.5, 7, nan])
 
 
-def test_colours_spread_over_the_mesh_where_none_is_known() -> None:
-    """Black below 0.4 m and white above 1.2 m: in between, the harmonic function of a column is linear in height."""
+def test_unknown_colours_are_interpolated_over_the_mesh() -> None:
+    """The column is black below 0.4 m and white above 1.2 m. In between, the harmonic function of a column is linear in
+    height."""
     column = upright_column(0.15, 0.0, 1.6)
     rig = clothed_rig(bending_body().rig, column)
     faces = np.arange(len(column.faces))
@@ -108,7 +110,7 @@ def test_colours_spread_over_the_mesh_where_none_is_known() -> None:
     np.testing.assert_array_equal(result[~between], colours[~between])
 
 
-def test_a_part_without_any_colour_takes_the_mean() -> None:
+def test_a_component_without_any_colour_takes_the_mean() -> None:
     near = upright_column(0.15, 0.0, 1.6)
     rig = clothed_rig(bending_body().rig, twice(near, (1.0, 0, 0)))
     faces = torch.arange(len(rig.faces))

@@ -29,20 +29,20 @@ TYPES = {5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 
 @pytest.fixture(scope="module", params=["full", "game"])
 def rig(request: pytest.FixtureRequest) -> str:
-    """Return the name of a rig."""
+    """Return the name of each rig in turn."""
     return str(request.param)
 
 
 @pytest.fixture(scope="module")
 def glb(rig: str, staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a rig."""
+    """Return the glTF file of a rig."""
     path = tmp_path_factory.mktemp("glb") / "avatar.glb"
     write_glb(path, staged, staged.rigs[rig])
     return path
 
 
 def accessor(document: pygltflib.GLTF2, index: int) -> np.ndarray:
-    """Return the numbers of an accessor."""
+    """Return the values of an accessor."""
     item = document.accessors[index]
     if item.sparse:
         at = numbers(document, item.sparse.indices.bufferView, item.sparse.indices.componentType)
@@ -53,14 +53,14 @@ def accessor(document: pygltflib.GLTF2, index: int) -> np.ndarray:
 
 
 def numbers(document: pygltflib.GLTF2, buffer_view: int, component_type: int) -> np.ndarray:
-    """Return what a buffer view holds."""
+    """Return the contents of a buffer view as an array."""
     view = document.bufferViews[buffer_view]
     data = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
     return np.frombuffer(data, TYPES[component_type])
 
 
 def played(document: pygltflib.GLTF2, key: int) -> np.ndarray:
-    """Return the mesh's points (N, 3) at a key of the first animation, as the glTF specification skins them."""
+    """Return the mesh's points (N, 3) at a key of the first animation, skinned as the glTF specification says."""
     nodes = document.nodes
     place = {n: (np.array(node.translation or [0, 0, 0]), np.array(node.rotation or [0, 0, 0, 1.0]))
              for n, node in enumerate(nodes)}  # fmt: skip
@@ -102,7 +102,7 @@ def played(document: pygltflib.GLTF2, key: int) -> np.ndarray:
     return moved
 
 
-def test_gltf_skins_as_we_do(glb: Path, staged: StagedAvatar) -> None:
+def test_gltf_skinning_matches_ours(glb: Path, staged: StagedAvatar) -> None:
     document = pygltflib.GLTF2.load(str(glb))
     vertex = np.zeros(len(staged.uvs), int)
     vertex[staged.face_uvs] = staged.faces
@@ -115,7 +115,7 @@ def test_another_reader_finds_mesh_texture_and_joints(glb: Path, rig: str, stage
     (mesh,) = scene.geometry.values()
     np.testing.assert_allclose(np.asarray(mesh.triangles), staged.rest_points_m[staged.faces], atol=1e-6)
     np.testing.assert_array_equal(np.asarray(mesh.visual.material.baseColorTexture), staged.texture)
-    corners = mesh.visual.uv[mesh.faces]  # trimesh turns v up again
+    corners = mesh.visual.uv[mesh.faces]  # trimesh flips v back to pointing up
     np.testing.assert_allclose(corners, staged.uvs[staged.face_uvs], atol=1e-6)
     document = pygltflib.GLTF2.load(str(glb))
     inverse_bind = accessor(document, document.skins[0].inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
@@ -123,7 +123,7 @@ def test_another_reader_finds_mesh_texture_and_joints(glb: Path, rig: str, stage
         assert np.abs(matrix @ scene.graph.get(name)[0] - np.eye(4)).max() < 1e-6
 
 
-def test_a_normal_map_has_its_tangents(glb: Path, staged: StagedAvatar) -> None:
+def test_a_normal_map_comes_with_tangents(glb: Path, staged: StagedAvatar) -> None:
     document = pygltflib.GLTF2.load(str(glb))
     (primitive,) = document.meshes[0].primitives
     normals = normals_of(staged.rest_points_m, staged.faces)
@@ -163,7 +163,7 @@ def test_the_albedo_is_another_variant_of_the_material(glb: Path, staged: Staged
 
 def test_motion_is_in_seconds_from_the_first_frame(glb: Path) -> None:
     document = pygltflib.GLTF2.load(str(glb))
-    (animation,) = document.animations  # other rates would be the same again
+    (animation,) = document.animations  # at other rates it would be the same motion
     assert animation.name == "captured"
     assert [(c.target.node, c.target.path) for c in animation.channels] == [
         (0, "translation"),
@@ -171,7 +171,7 @@ def test_motion_is_in_seconds_from_the_first_frame(glb: Path) -> None:
         (1, "translation"),
         (2, "rotation"),
         (3, "weights"),
-    ]  # the root turns, so that the pelvis need not
+    ]  # the root has the rotation, so the pelvis needs none
     np.testing.assert_allclose(accessor(document, animation.samplers[0].input)[:, 0], [0, 0.1, 0.2, 0.5])
     translation = accessor(document, animation.samplers[0].output)
     # World (0.1 frame, 2, floor) is stage (0.1 frame, floor, -2).
@@ -179,7 +179,7 @@ def test_motion_is_in_seconds_from_the_first_frame(glb: Path) -> None:
     assert len(np.unique(translation[:, 1])) == 1
 
 
-def test_correctives_are_morph_targets_with_a_weight_a_frame(glb: Path, staged: StagedAvatar) -> None:
+def test_correctives_are_morph_targets_with_one_weight_per_frame(glb: Path, staged: StagedAvatar) -> None:
     document = pygltflib.GLTF2.load(str(glb))
     (primitive,) = document.meshes[0].primitives
     vertex = np.zeros(len(staged.uvs), int)
@@ -215,7 +215,7 @@ def test_expressions_and_physiques_are_morph_targets_after_the_correctives(glb: 
 
 
 def test_the_khronos_validator_finds_nothing(glb: Path) -> None:
-    """Needs `npm install gltf-validator` in a folder above, or one that NODE_PATH names."""
+    """Needs `npm install gltf-validator` in a parent folder or in one that NODE_PATH names."""
     node = shutil.which("node")
     if not node or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode:
         pytest.skip(f"no npm package gltf-validator (NODE_PATH={os.environ.get('NODE_PATH', '')})")

@@ -12,8 +12,8 @@ from hnerf.asset.texture import UvLayout, unwrap
 from tests.asset.figure import upright_column
 
 
-def test_a_cube_needs_its_corners_alone() -> None:
-    """A cube of 2 m, each of whose twelve halves of sides is cut into four, in one chart without an outline."""
+def test_a_cube_is_simplified_to_its_corners() -> None:
+    """A cube of 2 m whose twelve triangles are each cut into four, unwrapped into one chart without an outline."""
     cube = trimesh.creation.box((2, 2, 2)).subdivide()
     unused = np.zeros((1, 2), np.float32)
     layout = UvLayout(np.concatenate([unused, cube.vertices[:, :2].astype(np.float32)]), 1 + np.array(cube.faces))
@@ -28,19 +28,19 @@ def test_a_cube_needs_its_corners_alone() -> None:
 
 
 def signed_area(level: Level) -> float:
-    """Return the area of the faces in the texture; mirrored ones count as negative."""
+    """Return the area of the faces in the texture; mirrored faces count as negative."""
     a, b, c = level.layout.uvs[level.layout.face_uvs].swapaxes(0, 1)
     return float((((b - a)[:, 0] * (c - a)[:, 1]) - ((b - a)[:, 1] * (c - a)[:, 0])).sum() / 2)
 
 
 def places(level: Level) -> set[tuple[float, ...]]:
-    """Return the vertex and the texture coordinates of each corner of a face."""
+    """Return the vertex and the texture coordinates of each face corner."""
     uvs = level.layout.uvs[level.layout.face_uvs].reshape(-1, 2)
     return {tuple(row) for row in np.column_stack([level.vertices[level.faces].ravel(), uvs]).tolist()}
 
 
-def test_charts_keep_their_seams(caplog: pytest.LogCaptureFixture) -> None:
-    """A closed column whose charts have seams of 224 edges in all: no level has less than 336 faces."""
+def test_levels_of_detail_keep_all_seams_of_the_charts(caplog: pytest.LogCaptureFixture) -> None:
+    """A closed column whose charts have seams with 224 edges in all, so no level can have fewer than 336 faces."""
     column = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(column.vertices, column.faces, 64)
     whole, coarse = levels_of(column.vertices, column.faces, layout, [5000, 400, 335])
@@ -56,9 +56,10 @@ def test_charts_keep_their_seams(caplog: pytest.LogCaptureFixture) -> None:
     assert "level of detail of 335 triangles left out: the texture's seams alone have 224 edges" in caplog.text
 
 
-def test_the_distance_of_a_level_is_that_of_points_on_either(staged: StagedAvatar) -> None:
-    """A roof of two slopes of 45 degrees, its ridge at x = 1, and the floor below it. Above x on the floor, the nearest
-    slope is x / sqrt 2 away; from x on a slope, the floor is x away: (1 / sqrt 2 + 1) / 4 on average over both."""
+def test_the_distance_of_a_level_is_averaged_over_points_of_both_meshes(staged: StagedAvatar) -> None:
+    """A roof of two slopes of 45 degrees with its ridge at x = 1, and the floor below it. From x on the floor, the
+    nearest slope is x / sqrt 2 away; from x on a slope, the floor is x away: (1 / sqrt 2 + 1) / 4 on average over
+    both."""
     points_m = np.array([[0.0, 0, 0], [0, 9, 0], [1, 0, 1], [1, 9, 1], [2, 0, 0], [2, 9, 0]])
     roof, floor = np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]]), np.array([[0, 2, 3], [0, 3, 1]])
     layout = UvLayout(np.zeros((6, 2), np.float32), roof)
@@ -67,4 +68,4 @@ def test_the_distance_of_a_level_is_that_of_points_on_either(staged: StagedAvata
     assert figures["lod0"] == {"vertices": 6, "triangles": 4}
     assert (figures["lod1"]["vertices"], figures["lod1"]["triangles"]) == (4, 2)
     assert figures["lod1"]["to_lod0_mean_mm"] == pytest.approx(250 / np.sqrt(2) + 250, rel=0.02)
-    assert figures["lod1"]["to_lod0_p99_mm"] == pytest.approx(980, rel=0.01)  # 2 % of the slopes are above 0.98 m
+    assert figures["lod1"]["to_lod0_p99_mm"] == pytest.approx(980, rel=0.01)  # 2 % of the slopes lie above 0.98 m

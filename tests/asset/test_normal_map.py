@@ -1,4 +1,4 @@
-"""The normal map of a small flat square, for a field whose surface is a plane that leans."""
+"""The normal map of a small flat square, for a field whose surface is a tilted plane."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from hnerf.body.base_mesh import BaseMesh
 from tests.asset.figure import bending_body, column_rig
 from tests.asset.stand_in import StandInAvatar
 
-SIDE_M = 1e-4  # so small that the plane, which leans, is on it everywhere
+SIDE_M = 1e-4  # so small that the tilted plane is close to it everywhere
 CORNERS = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 HALVES = np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -31,7 +31,7 @@ class Plane(StandInAvatar):
 
 
 def square(hidden: bool = False) -> AssetMesh:
-    """Return the square on the ground, one corner at the origin."""
+    """Return a square on the ground with one corner at the origin."""
     vertices_m = torch.from_numpy(np.pad(SIDE_M * CORNERS, ((0, 0), (0, 1)))).float()
     rig = dataclasses.replace(column_rig(), vertices_m=vertices_m, faces=torch.from_numpy(HALVES))
     return AssetMesh(rig, as_they_are, 2, BaseMesh(rig, np.full(4, hidden), 2, None, None, {}, {}))
@@ -54,7 +54,9 @@ def map_of(
         ((0.6, 0, 0.8), CORNERS[:, ::-1] * (1, -1) + (0, 1), (128, 51, 230)),  # turned: v falls along x
     ],
 )
-def test_a_plane_that_leans(normal: tuple[float, float, float], uvs: np.ndarray, colour: tuple[int, int, int]) -> None:
+def test_normal_map_of_a_tilted_plane(
+    normal: tuple[float, float, float], uvs: np.ndarray, colour: tuple[int, int, int]
+) -> None:
     found = map_of(normal, uvs)
     assert found.shape == (8, 8, 3) and found.dtype == np.uint8
     np.testing.assert_allclose(found, np.broadcast_to(colour, found.shape), atol=1)
@@ -68,15 +70,15 @@ def test_a_plane_that_leans(normal: tuple[float, float, float], uvs: np.ndarray,
         ((0.6, 0, 0.8), 0, True),
     ],
 )
-def test_it_is_flat_where_the_field_says_nothing_of_the_mesh(
+def test_normal_map_is_flat_where_the_field_is_no_match(
     normal: tuple[float, float, float], height_m: float, hidden: bool
 ) -> None:
     found = map_of(normal, CORNERS, height_m, hidden)
     np.testing.assert_array_equal(found, np.broadcast_to((128, 128, 255), found.shape))
 
 
-def test_half_of_the_trust_is_halfway() -> None:
-    # A step of 12.5 mm leaves 12.5 - 0.8 x 12.5 = 2.5 mm: between (0, 0, 1) and (0.6, 0, 0.8) is (0.3, 0, 0.9), at unit
-    # length (0.316, 0, 0.949).
+def test_half_trust_blends_the_normals_half_way() -> None:
+    # A step of 12.5 mm leaves 12.5 - 0.8 x 12.5 = 2.5 mm, where trust is one half. Half-way between (0, 0, 1) and
+    # (0.6, 0, 0.8) is (0.3, 0, 0.9), or (0.316, 0, 0.949) at unit length.
     found = map_of((0.6, 0, 0.8), CORNERS, 0.0125)
     np.testing.assert_allclose(found, np.broadcast_to((168, 128, 248), found.shape), atol=1)

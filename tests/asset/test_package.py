@@ -23,8 +23,8 @@ from tests.asset.figure import FRAMES, INFO, bending_body, write_all
 
 
 def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
-    """Return the points of the only mesh at a time code as OpenUSD evaluates them: blend shapes, then UsdSkel's
-    skin."""
+    """Return the points of the only mesh at a time code as OpenUSD evaluates them: blend shapes, then UsdSkel
+    skinning."""
     root = UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body"))
     (mesh,) = (UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
     cache = UsdSkel.Cache()
@@ -44,12 +44,13 @@ def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
 
 
 def selected(stage: Usd.Stage, *sets: str) -> list[str]:
-    """Return what is selected in variant sets."""
+    """Return the selections of variant sets."""
     return [stage.GetDefaultPrim().GetVariantSet(name).GetVariantSelection() for name in sets]
 
 
-def expect_our_skin(stage: Usd.Stage, staged: StagedAvatar) -> list[np.ndarray]:
-    """Compare the first and the last pose of the selected motion with our own skinning; return all poses of ours."""
+def expect_our_skinning(stage: Usd.Stage, staged: StagedAvatar) -> list[np.ndarray]:
+    """Assert that the first and the last pose of the selected motion match our own skinning; return all poses of
+    ours."""
     rig, motion, lod, shape = selected(stage, "rig", "motion", "lod", "shape")
     moving, shown = staged.rigs[rig].motions[motion], staged.levels[int(lod[-1])].vertices
     moved_m = staged.physiques_m.get(shape, np.zeros((1, 3)))
@@ -62,13 +63,13 @@ def expect_our_skin(stage: Usd.Stage, staged: StagedAvatar) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
-def test_usd_skins_as_we_do_in_every_variant(name: str, package: Path, staged: StagedAvatar) -> None:
+def test_usd_skinning_matches_ours_in_every_variant(name: str, package: Path, staged: StagedAvatar) -> None:
     stage = Usd.Stage.Open(str(package / name))
     seen = set()
     for _ in each_variant(stage):
         rig, motion, lod, shape = selected(stage, "rig", "motion", "lod", "shape")
         seen.add((rig, motion, lod, shape))
-        expected = expect_our_skin(stage, staged)
+        expected = expect_our_skinning(stage, staged)
         moving = staged.rigs[rig].motions[motion]
         for k in (0, len(moving.codes) - 1):
             code = moving.codes[k] * 10 / moving.fps
@@ -88,7 +89,7 @@ def test_usd_skins_as_we_do_in_every_variant(name: str, package: Path, staged: S
 
 
 @pytest.mark.parametrize(("name", "motion"), [("avatar.usda", "captured"), ("avatar_30.usda", "captured_30")])
-def test_each_topology_shows_the_whole_mesh_in_the_motion_of_the_file(name: str, motion: str, both: Path) -> None:
+def test_each_topology_selects_full_detail_and_the_motion_of_the_file(name: str, motion: str, both: Path) -> None:
     stage = Usd.Stage.Open(str(both / name))
     for topology in ("registered", "captured"):
         stage.GetDefaultPrim().GetVariantSet("topology").SetVariantSelection(topology)
@@ -105,7 +106,7 @@ def test_either_topology_is_skinned_in_all_its_variants(
     for _ in each_variant(stage):
         topology, *others = selected(stage, "topology", "rig", "motion", "lod", "shape")
         seen.add((topology, *others))
-        expect_our_skin(stage, {"registered": staged, "captured": captured}[topology])
+        expect_our_skinning(stage, {"registered": staged, "captured": captured}[topology])
     rigs, motions = ("full", "game"), ("captured", "captured_24", "captured_30")
     assert seen == {
         *itertools.product(["registered", "captured"], rigs, motions, ["lod0"], ["captured"]),
@@ -116,7 +117,9 @@ def test_either_topology_is_skinned_in_all_its_variants(
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_30.usda"])
 @pytest.mark.parametrize("lod", ["lod0", "lod1"])
-def test_another_shape_moves_the_skin_at_every_level(name: str, lod: str, package: Path, staged: StagedAvatar) -> None:
+def test_shape_variants_move_the_mesh_at_every_level_of_detail(
+    name: str, lod: str, package: Path, staged: StagedAvatar
+) -> None:
     stage = Usd.Stage.Open(str(package / name))
     stage.SetEditTarget(stage.GetSessionLayer())
     root, kept = stage.GetDefaultPrim(), staged.levels[int(lod[-1])].vertices
@@ -143,7 +146,7 @@ def test_without_physiques_the_captured_shape_is_the_only_one(staged: StagedAvat
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
-def test_all_detail_is_shown_unless_less_is_chosen(name: str, package: Path, staged: StagedAvatar) -> None:
+def test_full_detail_is_the_default(name: str, package: Path, staged: StagedAvatar) -> None:
     stage = Usd.Stage.Open(str(package / name))
     stage.SetEditTarget(stage.GetSessionLayer())
     detail = stage.GetDefaultPrim().GetVariantSet("lod")
@@ -175,9 +178,7 @@ def test_the_captured_frames_are_the_time_codes(name: str, package: Path, staged
 
 
 @pytest.mark.parametrize("lod", ["lod0", "lod1"])
-def test_expressions_are_shapes_of_some_points_that_no_motion_uses(
-    lod: str, package: Path, staged: StagedAvatar
-) -> None:
+def test_expressions_are_sparse_blend_shapes_that_no_motion_uses(lod: str, package: Path, staged: StagedAvatar) -> None:
     stage = Usd.Stage.Open(str(package / "avatar.usda"))
     stage.SetEditTarget(stage.GetSessionLayer())
     stage.GetDefaultPrim().GetVariantSet("lod").SetVariantSelection(lod)
@@ -205,7 +206,9 @@ def test_correctives_change_the_normals(package: Path, staged: StagedAvatar) -> 
     assert np.abs((bent - rest)[moved]).max() > 0.01
 
 
-def test_a_level_without_the_points_of_an_expression_has_it_all_the_same(staged: StagedAvatar, tmp_path: Path) -> None:
+def test_a_level_that_lacks_an_expressions_points_still_has_the_expression(
+    staged: StagedAvatar, tmp_path: Path
+) -> None:
     gone = np.setdiff1d(staged.levels[0].vertices, staged.levels[1].vertices)[0]
     wink_m = np.zeros((len(staged.rest_points_m), 3), np.float32)
     wink_m[gone] = 0.01
@@ -228,13 +231,13 @@ def test_an_interface_at_another_rate_has_whole_time_codes(rate: int, package: P
     )  # fmt: skip
     motion = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Motion/full"))
     assert motion.GetRotationsAttr().GetTimeSamples() == codes.tolist()
-    # 0.5 s, the capture's frame 5, is in the middle of both.
+    # 0.5 s, the capture's frame 5, is a whole time code at either rate.
     np.testing.assert_allclose(skinned_points(stage, rate / 2), staged.points_m[2], atol=1e-5)
 
 
-def test_further_motions_begin_with_the_captured_one_and_none_is_cut_off(tmp_path: Path) -> None:
-    """Captured are 0.3 to 0.8 s. 31 poses at 20 a second, whatever their numbers, take 1.5 s: from 0.3 to 1.8 s, which
-    are codes 3 to 18 at 10 a second, and 7.2 to 43.2 at 24."""
+def test_further_motions_start_with_the_captured_one_and_none_is_truncated(tmp_path: Path) -> None:
+    """The captured motion runs from 0.3 to 0.8 s. The further one has 31 poses at 20 a second, which take 1.5 s
+    whatever their frame numbers: from 0.3 to 1.8 s, which is codes 3 to 18 at 10 a second and 7.2 to 43.2 at 24."""
     body = bending_body()
     rows = [0] * 31
     dance = BodyFit(body.rig, tuple(range(7, 38)), body.theta[rows], body.root[rows])
@@ -253,16 +256,16 @@ def test_further_motions_begin_with_the_captured_one_and_none_is_cut_off(tmp_pat
     np.testing.assert_allclose(motion.GetRotationsAttr().GetTimeSamples(), np.arange(3, 18.1, 0.5), atol=1e-9)
 
 
-def test_the_same_avatar_is_silently_packed_to_the_same_bytes_at_any_time(
+def test_packing_an_avatar_again_later_gives_identical_bytes_and_no_output(
     package: Path, staged: StagedAvatar, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """ZIP counts in steps of two seconds."""
+    """ZIP timestamps have a resolution of two seconds, so wait for the next step."""
     time.sleep(max(0.0, (package / "avatar_cache.usdz").stat().st_mtime + 2.0 - time.time()))
     capfd.readouterr()
     write_all(tmp_path, staged)
     assert capfd.readouterr() == ("", "")
     written = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
-    # Interfaces, pictures, shapes, levels of detail, cameras, looks, rigs, motions, .usdz.
+    # Interfaces, images, shapes, levels of detail, cameras, looks, rigs, motions, .usdz.
     assert len(written) == 3 + 4 + 2 + 2 + 1 + 2 + 2 + 3 + 2
     for path in written:
         assert path.read_bytes() == (package / path.relative_to(tmp_path)).read_bytes(), path.name
@@ -281,7 +284,7 @@ def test_the_root_prim_says_what_the_asset_is(name: str, package: Path) -> None:
     assert (root.GetAssetInfoByKey("captureDigest"), root.GetAssetInfoByKey("licence")) == ("0123abcd", "CC0-1.0")
 
 
-def test_the_skeleton_says_its_rest_pose_and_names_elsewhere(package: Path) -> None:
+def test_the_skeleton_names_its_rest_pose_and_joints_of_other_skeletons(package: Path) -> None:
     stage = Usd.Stage.Open(str(package / "avatar.usda"))
     skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton"))
     assert list(skeleton.GetJointsAttr().Get()) == ["root", "root/pelvis", "root/pelvis/upper_L"]
@@ -291,15 +294,15 @@ def test_the_skeleton_says_its_rest_pose_and_names_elsewhere(package: Path) -> N
     assert data["jointNamesIn"]["mixamo"] == {"pelvis": "Hips"}
 
 
-def test_nothing_but_the_interface_is_loaded_without_payloads(package: Path) -> None:
+def test_without_payloads_only_the_interface_is_loaded(package: Path) -> None:
     stage = Usd.Stage.Open(str(package / "avatar.usda"), Usd.Stage.LoadNone)
     assert stage.GetDefaultPrim().GetChildren() == []
     assert len(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get()) == 2
 
 
-def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path) -> None:
+def test_the_extents_hint_contains_every_motion(staged: StagedAvatar, tmp_path: Path) -> None:
     boxes = {name: 100 * boxes for name, boxes in staged.extents_m.items()}
-    far = dataclasses.replace(staged, extents_m=boxes, physiques_m={})  # boxes of physiques have room for motions, too
+    far = dataclasses.replace(staged, extents_m=boxes, physiques_m={})  # physiques' boxes contain motions too
     write_usdz(tmp_path / "far.usdz", {"": far}, [], 10.0, INFO)
     stage = Usd.Stage.Open(str(tmp_path / "far.usdz"))
     hint = np.array(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get())
@@ -308,7 +311,7 @@ def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path
 
 
 def bound_surface(stage: Usd.Stage) -> UsdShade.Shader:
-    """Return the shader that the mesh shows."""
+    """Return the shader of the mesh's bound material."""
     mesh = next(prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
     return UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
 
@@ -319,7 +322,7 @@ def texture_of(surface: UsdShade.Shader, given: str) -> UsdShade.Shader:
 
 
 def pixels(path: Sdf.AssetPath) -> np.ndarray:
-    """Return the picture (H, W, 3) in a file of the package."""
+    """Return the image (H, W, 3) in a file of the package."""
     file = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path.resolvedPath))
     picture = cv2.imdecode(np.frombuffer(file.GetBuffer(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
@@ -343,7 +346,7 @@ def test_the_albedo_look_has_the_light_that_was_taken_out(name: str, package: Pa
     np.testing.assert_array_equal(pixels(light.GetTextureFileAttr().Get()), picture)
     assert surface.GetInput("ior").Get() == 1
     assert light.GetIntensityAttr().Get() == pytest.approx(intensity)
-    assert int(picture[0].min()) > 100 + int(picture[-1].max())  # above is Z in the world and Y in the stage
+    assert int(picture[0].min()) > 100 + int(picture[-1].max())  # up is Z in the world and Y in the stage
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_cache.usdz"])
@@ -355,12 +358,12 @@ def test_the_surface_has_a_texture_and_a_normal_map(name: str, package: Path, st
         texture = texture_of(surface, given)
         assert texture.GetInput("sourceColorSpace").Get() == space
         np.testing.assert_array_equal(pixels(texture.GetInput("file").Get()), expected)
-    # Of values from 0 to 1, so that they become components from -1 to 1.
+    # Scale and bias map values from 0 to 1 to components from -1 to 1.
     assert texture.GetInput("scale").Get() == (2, 2, 2, 1) and texture.GetInput("bias").Get() == (-1, -1, -1, 0)
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
-def test_each_topology_has_its_own_pictures(
+def test_each_topology_has_its_own_textures(
     name: str, both: Path, staged: StagedAvatar, captured: StagedAvatar
 ) -> None:
     stage = Usd.Stage.Open(str(both / name))
@@ -388,7 +391,7 @@ def test_a_normal_map_and_an_albedo_can_be_left_out(staged: StagedAvatar, tmp_pa
     assert [given.GetBaseName() for given in surface.GetInputs() if given.HasConnectedSource()] == ["diffuseColor"]
 
 
-def test_units_and_cameras_names(package: Path) -> None:
+def test_units_and_camera_names(package: Path) -> None:
     stage = Usd.Stage.Open(str(package / "avatar.usdz"))
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
     prims = stage.GetPrimAtPath("/Avatar/Cameras").GetChildren()

@@ -1,4 +1,4 @@
-"""Textures from photographs: squares before a camera, worked out by hand."""
+"""Textures from photographs: squares in front of a camera, worked out by hand."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +28,7 @@ FACES = np.array([[0, 2, 1], [0, 3, 2]])  # seen from the front, towards -z
 
 
 def camera(name: str = "front", angle: float = 0.0) -> Camera:
-    """Return a camera 2 m from the origin, turned about the vertical, at which a metre spans 50 px."""
+    """Return a camera 2 m from the origin, turned about the vertical. At the origin, 1 m spans 50 px."""
     c, s = np.cos(angle), np.sin(angle)
     R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
@@ -41,16 +41,16 @@ def square(half_m: float, z_m: float) -> np.ndarray:
 
 
 def texels_at(face: list[int], barycentric: list[list[float]]) -> Texels:
-    """Return texels on faces."""
+    """Return texels at given faces and barycentric coordinates."""
     place = torch.zeros(len(face), dtype=torch.long)
     return Texels(place, place, torch.tensor(face), torch.tensor(barycentric))
 
 
-MIDDLE = [0.5, 0.5, 0.0]  # of corners 0 and 2: the square's centre
+MIDDLE = [0.5, 0.5, 0.0]  # half-way between corners 0 and 2: the square's centre
 
 
 def capture(photographs: dict[str, int], cameras: list[Camera]) -> Any:
-    """Return a capture whose photographs are of one grey level each, of 255."""
+    """Return a capture whose photographs are each a uniform grey level from 0 to 255."""
     image = {name: np.full((SIZE_PX, SIZE_PX, 3), level, np.uint8) for name, level in photographs.items()}
     return SimpleNamespace(
         cameras={c.name: c for c in cameras},
@@ -62,7 +62,7 @@ def capture(photographs: dict[str, int], cameras: list[Camera]) -> Any:
 def colours_from_photographs(
     capture: Any, gains: Gains, surfaces_m: dict[int, np.ndarray], faces: np.ndarray, texels: Texels, field: np.ndarray
 ) -> np.ndarray:
-    """Return the blend of all that photographs show of texels."""
+    """Return the blended colours of texels from all photographs."""
     surfaces = {frame: SeenSurface.of(vertices_m, faces) for frame, vertices_m in surfaces_m.items()}
     blend = CapturedBlend(field)
     for seen in photographed_texels(capture, gains, surfaces, texels):
@@ -80,9 +80,9 @@ def test_a_texel_is_seen_where_it_projects() -> None:
     np.testing.assert_allclose(normals, [[0, 0, -1]], atol=1e-6)
 
 
-def test_normals_between_corners_are_unit_vectors() -> None:
-    """A fold's edge is turned by 22.5 degrees to +X, the corner left of it faces the camera; half-way, at (-0.1, 0, 0),
-    the normal is turned by 11.25 degrees."""
+def test_normals_between_corners_are_normalised() -> None:
+    """The normal on the edge of a fold is turned by 22.5 degrees towards +X; that of the corner left of it faces the
+    camera. Half-way, at (-0.1, 0, 0), the normal is turned by 11.25 degrees."""
     bend = np.pi / 4
     folded_m = np.array([[-0.2, 0, 0], [0, -0.2, 0], [0, 0.2, 0], [0.2 * np.cos(bend), 0, 0.2 * np.sin(bend)]])
     fold = SeenSurface.of(folded_m, np.array([[0, 2, 1], [1, 2, 3]]))
@@ -91,7 +91,7 @@ def test_normals_between_corners_are_unit_vectors() -> None:
     np.testing.assert_allclose(cosine, np.cos(bend / 4 - np.arctan(0.1 / 2)), atol=1e-6)
 
 
-def test_a_square_behind_another_is_hidden_and_one_from_behind_too() -> None:
+def test_occluded_and_back_facing_squares_are_hidden() -> None:
     vertices_m = np.concatenate([square(0.4, 0.0), square(0.4, -0.3)])
     both = np.concatenate([FACES, FACES + 4])
     index, _, _, _ = visible_texels(camera(), SeenSurface.of(vertices_m, both), texels_at([0, 2], [MIDDLE, MIDDLE]))
@@ -102,15 +102,15 @@ def test_a_square_behind_another_is_hidden_and_one_from_behind_too() -> None:
 
 
 def test_a_square_behind_the_camera_is_not_seen() -> None:
-    """It faces the camera, from 2 m behind it, and is mirrored in the middle of the picture."""
+    """The square is 2 m behind the camera and faces it; it projects, mirrored, to the middle of the image."""
     behind = SeenSurface.of(square(0.4, -4.0), FACES[:, ::-1].copy())
     index, _, _, _ = visible_texels(camera(), behind, texels_at([0], [MIDDLE]))
     assert len(index) == 0
 
 
-def test_a_slope_does_not_hide_itself() -> None:
-    """Seen at 60 degrees from 2 m away, a texel half a pixel, 1 cm, beside its pixel's ray is up to 1.7 cm farther away
-    than what the ray meets: less than 1 cm / cos 60."""
+def test_a_slanted_surface_does_not_occlude_itself() -> None:
+    """The surface is seen at 60 degrees from 2 m away. A texel that is half a pixel, 1 cm, off its pixel's ray is up to
+    1.7 cm farther away than the point that the ray hits, which is less than 1 cm / cos 60."""
     share = np.linspace(0.38, 0.5, 50)  # of corner 0, at x from 0.1 m to 0
     texels = texels_at([0] * 50, [[s, 0.5, 0.5 - s] for s in share.tolist()])
     index, cosine, _, _ = visible_texels(camera("side", np.pi / 3), SeenSurface.of(square(0.4, 0.0), FACES), texels)
@@ -119,7 +119,8 @@ def test_a_slope_does_not_hide_itself() -> None:
 
 
 def test_texels_near_an_outline_are_left_out() -> None:
-    """The square ends at 30 and at 70 px; the third pixel from there is the first whose neighbourhood has no jump."""
+    """The square ends at 30 and at 70 px. The third pixel inwards is the first whose neighbourhood has no depth
+    jump."""
     at_px = np.array([31.0, 34.0, 66.0, 69.0])
     share = (at_px - 30) / 40  # along the diagonal from corner 0 to corner 2
     texels = texels_at([0] * 4, [[1 - s, s, 0] for s in share.tolist()])
@@ -128,8 +129,9 @@ def test_texels_near_an_outline_are_left_out() -> None:
     np.testing.assert_allclose(pixels_px, [[34, 34], [66, 66]], atol=1e-4)
 
 
-def test_colours_are_means_by_the_fourth_power_of_the_cosine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Views at 0 and 60 degrees weigh 1 and 1/16, times their agreement with the field's 0.5, before sharpening."""
+def test_colours_are_weighted_by_the_fourth_power_of_the_cosine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before sharpening, views at 0 and 60 degrees have weights 1 and 1/16, times their agreement with the field's
+    0.5."""
     monkeypatch.setattr(photographs, "BACK_PROJECTIONS", 0)
     cameras = [camera(), camera("side", np.pi / 3)]
     found = colours_from_photographs(
@@ -158,8 +160,8 @@ def test_gains_are_divided_out_and_unseen_texels_keep_the_fields_colour() -> Non
     np.testing.assert_allclose(found, [[0.4, 0.4, 0.4], [0.1, 0.2, 0.3]], atol=1e-6)
 
 
-def test_a_photograph_that_contradicts_the_field_counts_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    """White against black is sqrt(3) / OUTLIER of an outlier."""
+def test_a_photograph_that_contradicts_the_field_has_little_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """White differs from the field's black by sqrt(3) / OUTLIER outlier scales."""
     monkeypatch.setattr(photographs, "BACK_PROJECTIONS", 0)
     white, texels = capture({"front": 255}, [camera()]), texels_at([0], [MIDDLE])
     found = colours_from_photographs(white, {}, {0: square(0.4, 0.0)}, FACES, texels, np.zeros((1, 3)))
@@ -167,17 +169,18 @@ def test_a_photograph_that_contradicts_the_field_counts_little(monkeypatch: pyte
     assert found[0, 0] == pytest.approx(vote / (vote + FIELD_WEIGHT), abs=1e-6)
 
 
-def test_a_pixel_should_be_the_mean_of_its_texels() -> None:
-    """Three texels lie in a pixel of 0.5 and have a mean of 0.4; one in a pixel of 0.2 has 0.3."""
+def test_unexplained_colour_is_pixel_minus_mean_of_its_texels() -> None:
+    """Three texels lie in a pixel of 0.5 and have a mean of 0.4; a fourth, of 0.3, lies in a pixel of 0.2."""
     levels = np.array([[0.2], [0.3], [0.6], [0.4]]) * [1, 1, 1]
     pixel, photograph = np.array([0, 1, 0, 0]), np.array([[0.5] * 3, [0.2] * 3])
     pixels = TexelPixels(np.array([1, 2, 3, 4]), pixel, photograph)
     np.testing.assert_allclose(pixels.unexplained(levels)[:, 0], [0.1, -0.1, 0.1, 0.1])
 
 
-def test_photographs_that_were_averaged_over_pixels_show_stripes_again() -> None:
-    """Stripes of one texel, 0.3 and 0.5, in pixels of three texels that begin at each of three places: pixels see 0.367
-    or 0.433. Texels are seen in the pixels around them, whose mean has a sixth of the contrast or less."""
+def test_sharpening_recovers_stripes_averaged_by_pixels() -> None:
+    """The stripes are one texel wide, 0.3 and 0.5. Three photographs have pixels of three texels, each starting at
+    another texel, so their pixels see 0.367 or 0.433. The mean of the pixels around a texel has a sixth of the contrast
+    or less."""
     stripes = np.where(np.arange(60) % 2 == 0, 0.3, 0.5)[:, None] * [1, 1, 1]
     projection, mean = BackProjection(), np.zeros((60, 3))
     for start in range(3):
@@ -191,9 +194,9 @@ def test_photographs_that_were_averaged_over_pixels_show_stripes_again() -> None
     assert after < 0.85 * before
 
 
-def test_what_light_shows_is_divided_by_it() -> None:
-    """One texel of 0.5 in half the light should show 0.35: 0.1 too little, at a weight of 1 of 0.5 in all. It becomes
-    0.7, and stays."""
+def test_sharpening_divides_residuals_by_the_irradiance() -> None:
+    """A texel of albedo 0.5 at irradiance 0.5 should show 0.35. It shows 0.1 too little, at a weight of 1 of 0.5 in
+    all. It becomes 0.7, and stays there."""
     projection = BackProjection()
     pixels = TexelPixels(np.array([0]), np.array([0]), np.full((1, 3), 0.35))
     projection.add(pixels, np.ones((1, 1)), np.full((1, 1), 0.5))
@@ -201,7 +204,7 @@ def test_what_light_shows_is_divided_by_it() -> None:
 
 
 def test_a_texel_lies_in_the_pixel_that_it_projects_to() -> None:
-    """At (50, 40) and (50.2, 40)."""
+    """The texels project to (50, 40) and (50.2, 40)."""
     shaded: Any = capture({"front": 0}, [camera()])
     shaded.image("front", 0)[40, 50] = 200
     texels = texels_at([0, 0], [[0.5, 0.25, 0.25], [0.495, 0.255, 0.25]])
@@ -211,8 +214,8 @@ def test_a_texel_lies_in_the_pixel_that_it_projects_to() -> None:
     np.testing.assert_allclose(seen.pixels.colours, [[200 / 255 / 0.8] * 3], rtol=1e-6)
 
 
-def test_colours_between_pixels_are_bilinear_and_beyond_the_border_its_own() -> None:
-    """Of rows 0, 100 and 50, 250, a quarter to the right and half way down: (25 + 100) / 2."""
+def test_sampling_is_bilinear_and_clamped_to_the_border() -> None:
+    """The image has rows 0, 100 and 50, 250. A quarter to the right and half-way down is (25 + 100) / 2."""
     image = np.repeat(np.array([[0, 100], [50, 250]], np.uint8)[..., None], 3, 2)
     found = 255 * sampled(image, np.array([[0.25, 0.5], [-3.0, 0.5], [7.0, 9.0]]))
     np.testing.assert_allclose(found, np.repeat([[62.5], [25], [250]], 3, 1), rtol=1e-6)

@@ -12,12 +12,12 @@ from hnerf.evaluation.pictures import shoot
 from hnerf.geometry.mesh_queries import Surface
 
 RED, GREEN, BLUE = [255, 0, 0], [0, 255, 0], [0, 0, 255]
-FRONT = np.array([0.0, 0.2, 1.0])  # leaning back
+FRONT = np.array([0.0, 0.2, 1.0])  # tilted back
 
 
 @pytest.fixture
 def card(staged: StagedAvatar) -> StagedAvatar:
-    """Return a square card of two faces, 1 m wide, that faces +Z, with a texture of two by two colours."""
+    """Return a square card of two faces, 1 m wide and facing +Z, with a texture of two by two colours."""
     corners_m = np.array([[-0.5, 0, 0], [0.5, 0, 0], [0.5, 1, 0], [-0.5, 1, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     texture = np.array([[RED, GREEN], [BLUE, [255, 255, 0]]], np.uint8).repeat(32, 0).repeat(32, 1)
@@ -33,7 +33,7 @@ def surface_of(card: StagedAvatar) -> Surface:
 def test_the_texture_is_seen_upright_from_the_front(card: StagedAvatar) -> None:
     front = pictures.turntable_cameras(card.points_m[0], FRONT, 4)[0]
     picture = pictures.textured(shoot(surface_of(card), front), card)
-    # 300 x 400 px; the card is 282 px wide and as high, in the middle
+    # the image has 300 x 400 px; the card is 282 px wide and high, in the middle
     assert picture[100, 60].tolist() == RED
     assert picture[100, 240].tolist() == GREEN
     assert picture[300, 60].tolist() == BLUE
@@ -44,10 +44,10 @@ def test_the_turntable_goes_around_the_person(card: StagedAvatar) -> None:
     cameras = pictures.turntable_cameras(card.points_m[0], FRONT, 4)
     directions = [camera.forward.round(6).tolist() for camera in cameras]
     assert directions == [[0, 0, -1], [-1, 0, 0], [0, 0, 1], [1, 0, 0]]
-    assert all(camera.R[1].round(6).tolist() == [0, -1, 0] for camera in cameras)  # down
+    assert all(camera.R[1].round(6).tolist() == [0, -1, 0] for camera in cameras)  # image down is -Y
 
 
-def test_edges_are_lines_and_faces_are_not(card: StagedAvatar) -> None:
+def test_the_wireframe_draws_edges_over_grey_faces(card: StagedAvatar) -> None:
     front = pictures.turntable_cameras(card.points_m[0], FRONT, 4)[0]
     picture = pictures.wireframe(shoot(surface_of(card), front)).astype(int)
     diagonal, inside = picture[199, 150], picture[150, 100]

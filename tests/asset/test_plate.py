@@ -9,7 +9,7 @@ ONE_SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array(
 
 
 def strip(length: int, width: int, step_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return a flat grid of squares, each cut into two triangles."""
+    """Return a flat grid of squares, each split into two triangles."""
     x, y = np.meshgrid(np.arange(length + 1), np.arange(width + 1), indexing="ij")
     corner = (x[:-1, :-1] * (width + 1) + y[:-1, :-1]).ravel()
     right, up = corner + width + 1, corner + 1
@@ -20,7 +20,7 @@ def strip(length: int, width: int, step_m: float) -> tuple[np.ndarray, np.ndarra
 def test_laplacian_of_a_square_cut_in_two() -> None:
     area_m2, laplacian = cotangent_laplacian(*ONE_SQUARE)
     np.testing.assert_allclose(area_m2, [1 / 3, 1 / 6, 1 / 3, 1 / 6])
-    # Edges: half the cotangent of 45 degrees; the diagonal: cotangents of 90 degrees.
+    # An edge has half the cotangent of 45 degrees; the diagonal has cotangents of 90 degrees, which are 0.
     expected = [[1, -0.5, 0, -0.5], [-0.5, 1, -0.5, 0], [0, -0.5, 1, -0.5], [-0.5, 0, -0.5, 1]]
     np.testing.assert_allclose(laplacian.toarray(), expected, atol=1e-12)
 
@@ -28,11 +28,12 @@ def test_laplacian_of_a_square_cut_in_two() -> None:
 def test_weights_of_edges_between_obtuse_triangles_stay_positive() -> None:
     flat = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.1, 0], [0.5, -0.1, 0]])
     _, obtuse = cotangent_laplacian(flat, np.array([[0, 1, 2], [0, 3, 1]]))
-    assert obtuse[0, 1] == -LEAST_COTANGENT  # the cotangents of 157 degrees are -2.4 each
+    assert obtuse[0, 1] == -LEAST_COTANGENT  # both cotangents, of 157 degrees, are -2.4
 
 
-def test_waves_shorter_than_the_smoothing_length_are_left_out() -> None:
-    """A wave of length L keeps 1 / (1 + e + (2 pi l / L)^4) of its height."""
+def test_waves_shorter_than_the_smoothing_length_are_damped() -> None:
+    """With a smoothing length l, a wave of length L keeps 1 / (1 + e + (2 pi l / L)^4) of its height; e is
+    SKIN_WEIGHT."""
     vertices_m, faces = strip(120, 6, 0.005)
     plate = Plate.of(vertices_m, faces)
     for length_m, smoothing_m in ((0.1, 0.01), (0.1, 0.02), (0.2, 0.02)):
@@ -43,7 +44,7 @@ def test_waves_shorter_than_the_smoothing_length_are_left_out() -> None:
         assert kept == pytest.approx(1 / (1 + SKIN_WEIGHT + (2 * np.pi * smoothing_m / length_m) ** 4), rel=0.02)
 
 
-def test_where_nothing_is_trusted_the_plate_goes_on_smoothly() -> None:
+def test_untrusted_regions_are_filled_in_smoothly() -> None:
     vertices_m, faces = strip(60, 4, 0.01)
     trust = (np.abs(vertices_m[:, 0] - 0.3) > 0.05).astype(float)
     moved_m = Plate.of(vertices_m, faces).solver(trust, 0.01)(np.where(trust, 0.02, 5.0)[:, None])
@@ -57,7 +58,7 @@ def two_boxes(gap_m: float) -> trimesh.Trimesh:
 def test_pairs_across_a_gap() -> None:
     boxes = two_boxes(0.004)
     differences, width_m = facing_pairs(boxes.vertices, boxes.faces)
-    assert len(width_m) >= 2  # at least the middles of the two sides
+    assert len(width_m) >= 2  # at least the middles of the two facing sides
     across = differences @ boxes.vertices
     np.testing.assert_allclose(np.linalg.norm(across, axis=1), width_m, rtol=1e-3)
     normal = np.abs(across[:, 0]) / width_m
@@ -66,12 +67,13 @@ def test_pairs_across_a_gap() -> None:
     assert len(facing_pairs(apart.vertices, apart.faces)[1]) == 0
 
 
-def test_two_sides_of_a_gap_move_alike() -> None:
-    """Box 1 wants to move by d, box 2 to stay; across a gap much narrower than s they share the way."""
+def test_the_two_sides_of_a_narrow_gap_move_together() -> None:
+    """Box 1 is pulled by d, box 2 is held in place. The gap is much narrower than GAP_WEIGHT_M, so they share the
+    displacement."""
     boxes = two_boxes(GAP_WEIGHT_M / 10)
     plate = Plate.of(boxes.vertices, boxes.faces)
     first = boxes.vertices[:, 0] < 0.0101
     wanted = np.where(first, 0.01, 0.0)[:, None]
     moved = plate.solver(np.ones(len(wanted)), 0.1)(wanted)  # each box is stiff
-    assert moved[first].mean() - moved[~first].mean() < 0.004  # of 0.01
+    assert moved[first].mean() - moved[~first].mean() < 0.004  # without coupling it would be 0.01
     assert moved.mean() == pytest.approx(0.005, rel=0.01)

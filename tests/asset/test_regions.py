@@ -22,7 +22,8 @@ def test_regions_by_joint(joint: str, region: str) -> None:
 
 
 def test_distances_from_the_fields_surface_to_each_mesh() -> None:
-    """A field of 17 cm around meshes of 15 and 16.5 cm; distances to flat sides are a little longer than to circles."""
+    """The field's surface has a radius of 17 cm, the meshes 15 and 16.5 cm. Their sides are flat, so distances are a
+    little longer than between circles."""
     meshes = {}
     for name, radius_m in (("registered", 0.15), ("captured", 0.165)):
         surface = upright_column(radius_m, -0.02, 1.62)
@@ -36,8 +37,8 @@ def test_distances_from_the_fields_surface_to_each_mesh() -> None:
     assert line.startswith("torso: ") and "20 mm" in line and "topology=captured" in line
 
 
-def test_distances_by_region_are_those_of_the_skin_that_follows_its_joints() -> None:
-    """The head, from 0.8 m on, is 30 mm away, and what is below 20 mm."""
+def test_distances_are_assigned_to_regions_by_skinning_joints() -> None:
+    """The head, above 0.8 m, is 30 mm away from the field's surface, and everything below 20 mm."""
     mesh, field = upright_column(0.15, -0.02, 1.62), upright_column(0.17, -0.02, 1.62)
     field.vertices *= np.where(field.vertices[:, 2:] > 0.8, (18 / 17, 18 / 17, 1), 1)
     rig = clothed_rig(dataclasses.replace(column_rig(), joint_names=("root", "head")), mesh)
@@ -47,7 +48,7 @@ def test_distances_by_region_are_those_of_the_skin_that_follows_its_joints() -> 
     assert found["registered"]["torso"]["p95"] == pytest.approx(20, abs=0.5)
 
 
-def test_a_region_at_the_limit_is_no_finding() -> None:
+def test_a_region_exactly_at_the_limit_is_not_reported() -> None:
     assert findings({"all": {"mean": 50, "p95": 99}, "legs": {"mean": 1.0, "p95": LIMIT_MM}}) == []
 
 

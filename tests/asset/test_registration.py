@@ -13,7 +13,7 @@ from tests.asset.figure import column_rig, twice, upright_column
 
 
 def bare(mesh: trimesh.Trimesh) -> BaseMesh:
-    """Return a mesh as a body's, all of it skin."""
+    """Return a mesh as a body's base mesh in which every face is skin."""
     rig = dataclasses.replace(
         column_rig(),
         vertices_m=torch.from_numpy(np.asarray(mesh.vertices)).float(),
@@ -22,14 +22,14 @@ def bare(mesh: trimesh.Trimesh) -> BaseMesh:
     return base_mesh(rig)
 
 
-def test_a_column_grows_onto_the_surface_around_it() -> None:
+def test_registration_moves_a_column_onto_the_surface_around_it() -> None:
     body = base_mesh(column_rig())
     found = register(body, upright_column(0.17, -0.02, 1.62))
     radius_m, height_m = np.linalg.norm(found.vertices_m[:, :2], axis=1), found.vertices_m[:, 2]
     side = (height_m > 0.2) & (height_m < 1.4) & (radius_m > 0.1)
     assert side.sum() > 200
     np.testing.assert_allclose(radius_m[side], 0.17, atol=0.0015)
-    assert found.trust[side].min() > 0.7  # 2 cm: Geman-McClure at a third of its scale, of 6 cm
+    assert found.trust[side].min() > 0.7  # 2 cm is a third of the Geman-McClure scale, 6 cm
     assert not crossing_faces(found.vertices_m, body.rig.faces.numpy()[: body.skin_faces]).any()
 
 
@@ -42,8 +42,9 @@ def test_hidden_vertices_follow_their_neighbours() -> None:
     np.testing.assert_allclose(np.linalg.norm(found.vertices_m[hidden, :2], axis=1), 0.17, atol=0.003)
 
 
-def test_trust_in_a_match_by_distance_and_normals() -> None:
-    """At the scale a match keeps a quarter of its trust (Geman-McClure); none where the normals are opposite."""
+def test_trust_in_a_match_falls_with_distance_and_opposite_normals() -> None:
+    """A match at the distance of the scale keeps a quarter of its trust (Geman-McClure). It keeps none if the normals
+    are opposite."""
     inner, outer = upright_column(0.15, 0.0, 1.6), Surface(upright_column(0.17, -0.02, 1.62))
     scale_m = np.full(len(inner.vertices), 0.02)
     sides = (np.abs(inner.vertices[:, 2] - 0.8) < 0.5) & (np.linalg.norm(inner.vertices[:, :2], axis=1) > 0.1)
@@ -56,7 +57,7 @@ def test_trust_in_a_match_by_distance_and_normals() -> None:
 
 def test_two_fingers_stay_apart_in_a_mitten() -> None:
     finger = trimesh.creation.capsule(height=0.05, radius=0.008, count=[12, 12]).subdivide()
-    fingers = twice(finger, (0.019, 0, 0))  # 3 mm of air between
+    fingers = twice(finger, (0.019, 0, 0))  # with a gap of 3 mm
     middle_m = [0.0095, 0, 0.025]
     mitten = trimesh.creation.icosphere(subdivisions=4)
     mitten.vertices = mitten.vertices * (0.026, 0.014, 0.045) + middle_m
@@ -67,12 +68,12 @@ def test_two_fingers_stay_apart_in_a_mitten() -> None:
     gap_m = right[inner, 0].min() - left[inner, 0].max()
     assert 0.0015 < gap_m < 0.0045
     back = np.abs(found.vertices_m - middle_m) < (0.012, 1, 0.01)
-    assert np.abs(found.vertices_m[back.all(1), 1]).max() > 0.01  # the backs of the fingers went to the mitten's
+    assert np.abs(found.vertices_m[back.all(1), 1]).max() > 0.01  # finger backs moved onto the mitten's back
 
 
-def test_faces_that_cross_are_drawn_apart() -> None:
+def test_intersecting_faces_are_pulled_apart() -> None:
     box = trimesh.creation.box(extents=(0.02, 0.02, 0.02)).subdivide().subdivide()
-    boxes = twice(box, (0.0195, 0.001, 0.001))  # half a millimetre too near
+    boxes = twice(box, (0.0195, 0.001, 0.001))  # they overlap by half a millimetre
     vertices_m, faces = np.asarray(boxes.vertices), np.asarray(boxes.faces)
     assert crossing_faces(vertices_m, faces).any()
     apart_m = _loosened(vertices_m, faces, len(faces), Plate.of(vertices_m, faces))
@@ -80,12 +81,12 @@ def test_faces_that_cross_are_drawn_apart() -> None:
     assert np.abs(apart_m - vertices_m).max() < 0.003
 
 
-def test_crossing_faces_of_a_closed_box_are_none() -> None:
+def test_a_closed_box_has_no_crossing_faces() -> None:
     box = trimesh.creation.box(extents=(1, 1, 1))
     assert not crossing_faces(np.asarray(box.vertices), np.asarray(box.faces)).any()
 
 
-def test_a_body_without_known_mesh_has_nothing_hidden() -> None:
+def test_a_body_with_an_unknown_mesh_has_no_hidden_vertices() -> None:
     body = base_mesh(column_rig())
     assert body.uvs is None and not body.hidden.any()
     assert body.skin_faces == len(body.rig.faces) == pytest.approx(len(column_rig().faces))

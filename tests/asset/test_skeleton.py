@@ -9,19 +9,20 @@ def stage_joints(rig: Rig) -> np.ndarray:
     return at - [0, rig.vertices_m[:, 2].min().item(), at[0, 2]]
 
 
-def test_axes_by_hand() -> None:
-    """An arm to the left, a finger at its end, a foot to the front, and a head with a jaw in front of it."""
+def test_joint_axes_along_bones_by_hand() -> None:
+    """The skeleton has an arm to the left with a finger at its end, a foot to the front, and a head with a jaw in front
+    of it."""
     names = ("root", "upperarm_L", "hand_L", "foot_L", "toe_L", "head", "jaw")
     parents = np.array([-1, 0, 1, 0, 3, 0, 5])
     at = np.array([[0.0, 0, 0], [1, 1, 0], [2, 1, 0], [0.1, 0, 0], [0.1, 0, 0.2], [0, 1.5, 0], [0, 1.5, 0.1]])
     found = along_bones(names, parents, at)
-    np.testing.assert_allclose(found[1], np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), atol=1e-12)  # y left, z front
-    np.testing.assert_allclose(found[2], found[1])  # the last of a chain goes on
-    np.testing.assert_allclose(found[3], np.array([[-1, 0, 0], [0, 0, 1], [0, 1, 0]]), atol=1e-12)  # y front, z up
+    np.testing.assert_allclose(found[1], np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), atol=1e-12)  # y left, z to front
+    np.testing.assert_allclose(found[2], found[1])  # the last joint of a chain continues the direction
+    np.testing.assert_allclose(found[3], np.array([[-1, 0, 0], [0, 0, 1], [0, 1, 0]]), atol=1e-12)  # y to front, z up
     np.testing.assert_allclose(found[5], np.eye(3), atol=1e-12)  # the head points up
 
 
-def test_bones_point_along_the_body(rig: Rig) -> None:
+def test_joint_y_axes_point_along_their_bones(rig: Rig) -> None:
     skeleton = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "along")
     y = dict(zip(skeleton.names, skeleton.rotations[:, :, 1], strict=True))
     at = dict(zip(skeleton.names, skeleton.positions_m, strict=True))
@@ -29,19 +30,19 @@ def test_bones_point_along_the_body(rig: Rig) -> None:
                          ("index_01_R", "index_02_R"), ("spine_04", "spine_05")):  # fmt: skip
         bone = at[below] - at[above]
         np.testing.assert_allclose(y[above], bone / np.linalg.norm(bone), atol=1e-6)
-    np.testing.assert_allclose(y["pelvis"], y["spine_01"])  # they coincide
+    np.testing.assert_allclose(y["pelvis"], y["spine_01"])  # the two joints coincide
     assert y["head"] @ [0, 1, 0] > 0.99 and y["eye_L"] @ [0, 0, 1] > 0.99
     determinants = np.linalg.det(skeleton.rotations)
     np.testing.assert_allclose(determinants, 1)
     np.testing.assert_array_equal(skeleton.rotations[0], np.eye(3))
 
 
-def test_identity_bones(rig: Rig) -> None:
+def test_identity_axes_have_no_rotation(rig: Rig) -> None:
     skeleton = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "identity")
     np.testing.assert_array_equal(skeleton.rotations, np.tile(np.eye(3), (105, 1, 1)))
 
 
-def test_the_game_skeleton_folds_joints_in_series(rig: Rig) -> None:
+def test_the_game_skeleton_merges_serial_joints(rig: Rig) -> None:
     full = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "along")
     game, taken_by = game_skeleton(full, "along")
     assert len(game.names) == 55
@@ -58,7 +59,7 @@ def test_the_game_skeleton_folds_joints_in_series(rig: Rig) -> None:
     )
 
 
-def test_transforms_relative_to_parents_compose_again(rig: Rig) -> None:
+def test_local_transforms_compose_to_the_bind_transforms(rig: Rig) -> None:
     skeleton = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "along")
     local, composed = skeleton.local(skeleton.bind), skeleton.bind.copy()
     for j, parent in enumerate(skeleton.parents[1:], 1):

@@ -8,30 +8,31 @@ from hnerf.asset.skinning import Skin, skinned, with_few_influences
 
 
 def moves(*offsets_m: tuple[float, float, float]) -> np.ndarray:
-    """Return transforms (J, 4, 4) that move by offsets."""
+    """Return transforms (J, 4, 4) that translate by offsets."""
     transforms = np.tile(np.eye(4), (len(offsets_m), 1, 1))
     transforms[:, :3, 3] = offsets_m
     return transforms
 
 
-def test_points_by_hand() -> None:
-    """Between a joint that stays and one that turns a quarter about z and moves by 1 along x."""
+def test_skinned_points_by_hand() -> None:
+    """One joint stays; the other turns by a quarter about z and moves by 1 along x."""
     quarter = np.array([[0.0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     skin = Skin(np.array([[0, 1], [1, 0]]), np.array([[0.75, 0.25], [1.0, 0]]))
     found = skinned(np.stack([np.eye(4), quarter]), skin, np.array([[4.0, 0, 0], [4, 0, 0]]))
     np.testing.assert_allclose(found, [[0.75 * 4 + 0.25, 1, 0], [1, 4, 0]])
 
 
-def test_weights_of_folded_joints_add_up() -> None:
+def test_weights_of_merged_joints_add_up() -> None:
     skin = Skin(np.array([[1, 2, 3], [3, 0, 0]]), np.array([[0.5, 0.3, 0.2], [1.0, 0, 0]]))
-    found = skin.moved_to(np.array([0, 1, 0, 0]))  # 2 and 3 go to 0
+    found = skin.moved_to(np.array([0, 1, 0, 0]))  # joints 2 and 3 are merged into 0
     np.testing.assert_array_equal(found.joints, [[1, 0, 0], [0, 0, 0]])
     np.testing.assert_allclose(found.weights, [[0.5, 0.5, 0], [1, 0, 0]])
     assert found.influences == 2
 
 
-def test_eyes_move_eyeballs_alone() -> None:
-    """Two lids, and an eyeball or two, of which one alone would leave the face one-eyed."""
+def test_eye_joints_move_only_eyeballs_not_lids() -> None:
+    """The skin has two lids and one or two eyeballs. With only one eyeball, its joint is not used either, because the
+    face would be one-eyed."""
     joints, parents = ("head", "eye.L", "eye.R"), np.array([-1, 0, 0])
     lids = Skin(np.array([[1, 0], [2, 0]]), np.array([[0.6, 0.4], [0.7, 0.3]]))
     np.testing.assert_array_equal(without_lids(lids, joints, parents).joints, 0)
@@ -42,8 +43,8 @@ def test_eyes_move_eyeballs_alone() -> None:
         np.testing.assert_array_equal(without_lids(both, joints, parents).joints[:, 0], expected)
 
 
-def test_a_joint_that_moves_as_another_is_given_up_without_loss() -> None:
-    """Joints 1 and 2 move alike in all poses: their weights may be one joint's."""
+def test_joints_that_move_alike_are_merged_without_loss() -> None:
+    """Joints 1 and 2 move alike in all poses, so one joint can take the weights of both."""
     skin = Skin(np.array([[1, 2, 0]]), np.array([[0.4, 0.35, 0.25]]))
     poses = [(moves((0, 0, 0), (1, y, 0), (1, y, 0)), np.zeros((1, 3))) for y in (0.0, 2.0)]
     found = with_few_influences(skin, iter(poses), 2)
@@ -51,8 +52,8 @@ def test_a_joint_that_moves_as_another_is_given_up_without_loss() -> None:
     np.testing.assert_allclose(found.weights, [[0.75, 0.25]], atol=1e-6)
 
 
-def test_a_joint_without_weight_gets_none() -> None:
-    """Joint 0, which only fills the row, moves exactly as the blend of the three others does."""
+def test_a_joint_of_zero_weight_stays_unused() -> None:
+    """Joint 0 only pads the row, although it moves exactly as the blend of the three others does."""
     skin = Skin(np.array([[1, 2, 3, 0]]), np.array([[1 / 3, 1 / 3, 1 / 3, 0]]))
     poses = [(moves((1 / 3, 1 / 3, 1 / 3), (1, 0, 0), (0, 1, 0), (0, 0, 1)), np.zeros((1, 3)))]
     found = with_few_influences(skin, iter(poses), 2)
@@ -61,13 +62,13 @@ def test_a_joint_without_weight_gets_none() -> None:
 
 
 RANDOM = [np.random.default_rng(seed).normal(size=(3, 4, 3)) for seed in range(4)]
-# One pose in which the line through the last two joints passes nearest, but outside of them.
+# One pose in which the line through the last two joints comes nearest, but only outside the segment between them.
 OUTSIDE = np.array([[[3.0, -2, -1], [-2, -3, -3], [-3, 2, 2], [-2, 1, 1]]])
 
 
 @pytest.mark.parametrize("offsets_m", [*RANDOM, OUTSIDE])
 def test_the_best_subset_is_found(offsets_m: np.ndarray) -> None:
-    """As good as the best of many weights on any two of four joints."""
+    """The result is as good as the best of many weights on any two of four joints."""
     poses = [(moves(*pose), np.zeros((1, 3))) for pose in offsets_m]
     skin = Skin(np.array([[0, 1, 2, 3]]), np.array([[0.4, 0.3, 0.2, 0.1]]))
     found = with_few_influences(skin, iter(poses), 2)

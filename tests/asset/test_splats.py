@@ -46,7 +46,7 @@ def read_ply(path: Path) -> dict[str, np.ndarray]:
     return dict(zip(names, np.frombuffer(body, "<f4").reshape(COUNT, -1).T, strict=True))
 
 
-def test_faces_have_points_by_their_area_which_fill_them_evenly() -> None:
+def test_points_are_spread_over_faces_evenly_by_area() -> None:
     face, barycentric = evenly_on_faces(np.array([3.0, 0, 1]), 4000)
     assert np.bincount(face).tolist() == [3000, 0, 1000]
     np.testing.assert_allclose(barycentric.sum(1), 1)
@@ -54,13 +54,14 @@ def test_faces_have_points_by_their_area_which_fill_them_evenly() -> None:
     for k in (0, 2):
         inside = barycentric[face == k]
         np.testing.assert_allclose(inside.mean(0), 1 / 3, atol=2e-3)
-        # A quarter of the triangle is nearer to each corner than half its height, and in the middle.
+        # The medial triangle splits a triangle into four equal parts: one at each corner and one in the middle.
         quarters = [(inside[:, c] > 0.5).mean() for c in range(3)] + [(inside < 0.5).all(1).mean()]
         np.testing.assert_allclose(quarters, 0.25, atol=0.01)
 
 
-def test_one_layer_of_splats_lets_hardly_anything_through() -> None:
-    """A square metre of 800 faces: at random places, 0.4 % on average; of splats strewn at random it would be 2 %."""
+def test_one_layer_of_splats_is_nearly_opaque() -> None:
+    """The surface is a square metre of 800 faces. At random places, 0.4 % of the light passes on average; with splats
+    at random positions it would be 2 %."""
     row, rng = np.arange(20), np.random.default_rng(0)
     low = np.stack(np.meshgrid(row, row), -1).reshape(-1, 1, 2)
     corners_m = (
@@ -75,8 +76,9 @@ def test_one_layer_of_splats_lets_hardly_anything_through() -> None:
         assert through.mean() < 0.006 and np.quantile(through, 0.99) < 0.05
 
 
-def test_splats_have_their_share_of_the_area_and_the_textures_colours(staged: StagedAvatar, splats: Splats) -> None:
-    """The column of 24 sides, 18 cm and 1.7 m: its circumference is 48 sin(7.5°) radii, either end 12 sin(15°) r²."""
+def test_splats_are_sized_by_area_and_coloured_by_the_texture(staged: StagedAvatar, splats: Splats) -> None:
+    """The column has 24 sides, a radius of 18 cm and a height of 1.7 m. Its circumference is 48 sin(7.5°) radii, and
+    each end has an area of 12 sin(15°) r²."""
     area_m2 = 48 * np.sin(np.pi / 24) * 0.18 * 1.7 + 2 * 12 * np.sin(np.pi / 12) * 0.18**2
     assert splats.sigma_m == pytest.approx(1.4 * np.sqrt(area_m2 / (np.pi * COUNT)), rel=1e-6)
     np.testing.assert_allclose(splats.scales_m, splats.sigma_m * np.array([1, 1, 0.1]))
@@ -94,7 +96,7 @@ def test_orientations_turn_z_to_the_normals() -> None:
     quaternions = turned_to(normals)
     np.testing.assert_allclose(quaternions[:2], [[1, 0, 0, 0], [0.5**0.5, 0, 0.5**0.5, 0]], atol=1e-12)
     turned = Rotation.from_quat(quaternions, scalar_first=True).apply([0, 0, 1])
-    np.testing.assert_allclose(turned, normals, atol=2e-5)  # close to the opposite, that is taken
+    np.testing.assert_allclose(turned, normals, atol=2e-5)  # nearly opposite normals are taken as exactly opposite
 
 
 def test_the_ply_has_the_layout_of_3d_gaussian_splatting_at_rest(
@@ -121,12 +123,10 @@ def test_the_ply_has_the_layout_of_3d_gaussian_splatting_at_rest(
     np.testing.assert_allclose(turned.apply([0, 0, 1])[:, [0, 2]], np.stack([nx, nz], 1), atol=1e-5)
 
 
-def test_the_plys_skin_moves_splats_as_the_game_rig_moves_the_surface(
-    staged: StagedAvatar, splats: Splats, tmp_path: Path
-) -> None:
-    """The column has two bones, so no weight is lost. Inside a face weights differ by half at most, and what either
-    bone does to its points, 10 cm high, by 10 cm times 2 sin(angle / 2): their covariance is at most a quarter of the
-    product."""
+def test_ply_skinning_matches_the_game_rigs_surface(staged: StagedAvatar, splats: Splats, tmp_path: Path) -> None:
+    """The column has two bones, so no weight is dropped. Inside a face, weights differ by at most one half, and the
+    displacements by either bone differ by at most 10 cm, the face's height, times 2 sin(angle / 2). Their covariance is
+    at most a quarter of the product."""
     write_splat_ply(tmp_path / "a.ply", staged, splats)
     found, rig = read_ply(tmp_path / "a.ply"), staged.rigs[GAME]
     joints = np.stack([found[f"joint_{k}"] for k in range(4)], 1).astype(int)
@@ -146,13 +146,11 @@ def test_the_plys_skin_moves_splats_as_the_game_rig_moves_the_surface(
     np.testing.assert_allclose(moved_m[on_one_bone], surface_m[on_one_bone], atol=1e-5)
     figures = splat_figures(staged, splats)
     assert figures["count"] == COUNT and figures["sigma_mm"] == pytest.approx(1e3 * splats.sigma_m)
-    assert 5 < figures["moved_p99_mm"] < figures["moved_max_mm"] < 12  # bent by 0.8, with noise of 1 cm on points
+    assert 5 < figures["moved_p99_mm"] < figures["moved_max_mm"] < 12  # bent by 0.8 rad, with noise of 1 cm on points
 
 
-def test_the_plys_skin_has_the_four_strongest_joints_of_the_game_rig(
-    staged: StagedAvatar, splats: Splats, tmp_path: Path
-) -> None:
-    """All points follow five joints of six; the weakest, with a tenth, is left out."""
+def test_ply_skinning_keeps_the_four_strongest_joints(staged: StagedAvatar, splats: Splats, tmp_path: Path) -> None:
+    """All points follow five of six joints; the weakest, with a weight of 0.1, is dropped."""
     rig, points = staged.rigs[GAME], len(staged.rest_points_m)
     skin = Skin(np.tile([5, 1, 0, 4, 2], (points, 1)), np.tile([0.1, 0.3, 0.2, 0.25, 0.15], (points, 1)))
     six = dataclasses.replace(rig, skeleton=dataclasses.replace(rig.skeleton, names=tuple("abcdef")), skin=skin)
@@ -163,9 +161,7 @@ def test_the_plys_skin_has_the_four_strongest_joints_of_the_game_rig(
         np.testing.assert_allclose(found[f"weight_{k}"], weight / 0.9, rtol=1e-6)
 
 
-def test_usd_has_the_splats_on_the_skinned_surface_in_each_frame(
-    staged: StagedAvatar, splats: Splats, layer: Path
-) -> None:
+def test_usd_splats_lie_on_the_skinned_surface_in_each_frame(staged: StagedAvatar, splats: Splats, layer: Path) -> None:
     stage = Usd.Stage.Open(str(layer))
     assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y and UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (3, 8, 10)
@@ -183,12 +179,12 @@ def test_usd_has_the_splats_on_the_skinned_surface_in_each_frame(
         turned = [[*q.GetImaginary(), q.GetReal()] for q in prim.GetOrientationshAttr().Get(float(frame))]
         normals = splats.at(normals_of(surface_m, staged.faces))
         cosine = (Rotation.from_quat(turned).apply([0, 0, 1]) * normals).sum(1) / np.linalg.norm(normals, axis=1)
-        assert cosine.min() > 1 - 1e-5  # half precision is a milliradian
+        assert cosine.min() > 1 - 1e-5  # half precision resolves about a milliradian
         box_m = np.array(prim.GetExtentAttr().Get(float(frame)))
         np.testing.assert_allclose(box_m[0], found_m.min(0) - 3 * splats.sigma_m, atol=1e-5)
 
 
-def test_the_layer_passes_every_validator_and_is_the_same_bytes_again(
+def test_the_splat_layer_passes_every_validator_and_is_reproducible(
     staged: StagedAvatar, splats: Splats, layer: Path, tmp_path: Path
 ) -> None:
     report = validate_package(layer)
@@ -210,7 +206,7 @@ def test_the_layer_passes_every_validator_and_is_the_same_bytes_again(
         ("extent", Vt.Vec3fArray(2, (0, 0, 0)), "extent does not contain the positions at time 4"),
     ],
 )
-def test_each_defect_of_splats_is_named(layer: Path, attribute: str, value: object, message: str) -> None:
+def test_each_defect_of_splats_is_reported(layer: Path, attribute: str, value: object, message: str) -> None:
     copy = Sdf.Layer.CreateAnonymous()
     copy.TransferContent(Sdf.Layer.FindOrOpen(str(layer)))
     stage = Usd.Stage.Open(copy)
@@ -229,7 +225,7 @@ def test_a_layer_with_a_defect_is_refused(layer: Path, tmp_path: Path) -> None:
         validate_package(tmp_path / "copy.usdc")
 
 
-def test_a_picture_of_splats_is_that_of_the_mesh(staged: StagedAvatar) -> None:
+def test_rendered_splats_look_like_the_rendered_mesh(staged: StagedAvatar) -> None:
     grey = dataclasses.replace(staged, texture=np.full((64, 64, 3), 120, np.uint8))
     found, camera, gain = surface_splats(grey, 20_000), side_camera().scaled(0.5), (0.5, 1.0, 3.0)
     points_m = staged.points_m[1].astype(float) @ staged.stage_from_world

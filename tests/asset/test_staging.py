@@ -17,7 +17,7 @@ TEXTURE = np.zeros((4, 4, 3), np.uint8)
 
 
 def staged_without_shapes(clothed: BodyFit, up: str = "z") -> StagedAvatar:
-    """Return a body staged as it is skinned, without correctives, at 10 frames a second."""
+    """Return a body staged as skinned, without correctives, at 10 frames a second."""
     none = correctives_of(np.zeros((len(clothed.frames), len(clothed.rig.vertices_m), 3), np.float32), 0)
     return stage_avatar(clothed, clothed.vertices_m().numpy(), none, LAYOUT, TEXTURE, up, 10.0, "identity")
 
@@ -27,8 +27,8 @@ def test_z_up_becomes_y_up() -> None:
     np.testing.assert_array_equal(stage_from_world("y") @ [1, 2, 3], [1, 2, 3])
 
 
-def test_joints_by_hand() -> None:
-    """Place the body at (1, 2, 3) in the world; the upper joint bends 90 degrees about the body's x."""
+def test_staged_joints_by_hand() -> None:
+    """The body stands at (1, 2, 3) in the world; its upper joint bends by 90 degrees about the body's x."""
     theta = torch.tensor([[[0.0, 0, 0], [torch.pi / 2, 0, 0]]])
     root = torch.eye(4)[None].clone()
     root[0, :3, 3] = torch.tensor([1.0, 2, 3])
@@ -37,10 +37,10 @@ def test_joints_by_hand() -> None:
     assert full.skeleton.names == ("root", "pelvis", "upper_L")
     np.testing.assert_allclose(full.skeleton.positions_m, [[0, 0, 0], [0, 0, 0], [0, 0.8, 0]], atol=1e-7)
     motion = full.motions["captured"]
-    # The root stands below the pelvis on the floor, which is the lowest point of all: z = 3, stage y = 3.
+    # The root lies below the pelvis on the floor, at the height of the lowest point: z = 3, stage y = 3.
     np.testing.assert_allclose(motion.translations_m[0], [[1, 3, -2], [0, 0, 0], [0, 0.8, 0]], atol=1e-6)
     np.testing.assert_allclose(motion.quaternions[0, :2], [[0, 0, 0, 1]] * 2, atol=1e-7)
-    # x is common to both frames, so the bend stays a quarter turn about +x.
+    # World and stage share the x axis, so the bend stays a quarter turn about +x.
     np.testing.assert_allclose(motion.quaternions[0, 2], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-6)
     # The column's top centre (0, 0, 1.6) swings to (0, -0.8, 0.8) in the body: (1, 1.2, 3.8) in the world.
     top = staged.points_m[0][np.argmin(np.linalg.norm(staged.rest_points_m - [0, 1.6, 0], axis=1))]
@@ -56,23 +56,23 @@ def test_the_soles_are_on_the_ground_and_the_pelvis_above_the_origin() -> None:
     np.testing.assert_allclose(staged.rigs["full"].skeleton.positions_m[:2], 0, atol=1e-6)
 
 
-def test_the_root_stands_where_most_frames_do() -> None:
-    """The lowest points of four frames are at 0.5, 0.5, 0.3 and 0.5 m."""
+def test_the_root_is_at_the_ground_height_of_most_frames() -> None:
+    """The lowest points of the four frames are at 0.5, 0.5, 0.3 and 0.5 m."""
     body = bending_body()
     body.root[2, 2, 3] -= 0.2
     motion = staged_without_shapes(body).rigs["full"].motions["captured"]
     np.testing.assert_allclose(motion.translations_m[:, 0, 1], 0.5, atol=1e-6)
 
 
-def test_both_rigs_move_the_surface_as_the_body_does(staged: StagedAvatar) -> None:
+def test_both_rigs_reproduce_the_bodys_surface(staged: StagedAvatar) -> None:
     for rig in staged.rigs.values():
         for found_m, true_m in zip(rig.surfaces_m("captured", staged.rest), staged.points_m, strict=True):
             np.testing.assert_allclose(found_m, true_m, atol=1e-5)
 
 
-def test_other_rates_are_the_same_motion_at_whole_frames(staged: StagedAvatar) -> None:
-    """Frames 3 to 8 at 10 a second are 0.3 to 0.8 s: codes 8 to 19 of 24, and 9 to 24 of 30, which has every instant of
-    the capture."""
+def test_other_frame_rates_resample_the_motion_at_whole_frames(staged: StagedAvatar) -> None:
+    """Frames 3 to 8 at 10 a second run from 0.3 to 0.8 s: codes 8 to 19 at 24 a second, and 9 to 24 at 30, which
+    include every captured frame."""
     motions = staged.rigs["full"].motions
     np.testing.assert_array_equal(motions["captured"].codes, FRAMES)
     np.testing.assert_array_equal(motions["captured_24"].codes, np.arange(8, 20))
@@ -82,7 +82,7 @@ def test_other_rates_are_the_same_motion_at_whole_frames(staged: StagedAvatar) -
         np.testing.assert_allclose(surfaces_m[3 * frame - 9], true_m, atol=1e-5)
 
 
-def test_how_far_the_boxes_of_a_long_motion_are_is_told() -> None:
+def test_progress_is_reported_while_bounding_boxes_are_computed() -> None:
     heard: list[Progress] = []
     with listening(heard.append):
         staged = staged_without_shapes(bending_body())
@@ -91,7 +91,8 @@ def test_how_far_the_boxes_of_a_long_motion_are_is_told() -> None:
 
 
 def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:
-    """One triangle on a texture of 4 x 4 whose red is the column and green the row from the top."""
+    """One triangle lies on a texture of 4 x 4 texels whose red is the column and whose green is the row from the
+    top."""
     texture = np.stack([*np.meshgrid(range(4), range(4)), np.zeros((4, 4))], -1).astype(np.uint8)
     uvs = np.array([[0.1, 0.9], [0.9, 0.9], [1.0, 0.0]])
     triangle = dataclasses.replace(
@@ -103,8 +104,8 @@ def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:
     np.testing.assert_array_equal(triangle.vertex_colours, [[3, 0, 0], [3, 3, 0], [0, 0, 0]])
 
 
-def test_expressions_and_physiques_turn_to_the_stages_axes(staged: StagedAvatar) -> None:
-    stout_m = 0.3 * staged.rest_points_m * (1, 0, 1)  # the column stands on the axis
+def test_expressions_and_physiques_are_rotated_to_stage_axes(staged: StagedAvatar) -> None:
+    stout_m = 0.3 * staged.rest_points_m * (1, 0, 1)  # the column stands on the vertical axis
     np.testing.assert_allclose(staged.physiques_m["stout"], stout_m, atol=1e-6)
     moved_m = staged.expressions_m["frown"]
     top = moved_points(moved_m)
@@ -115,7 +116,7 @@ def test_expressions_and_physiques_turn_to_the_stages_axes(staged: StagedAvatar)
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_quaternions_do_not_jump(up: str) -> None:
-    turns = torch.linspace(0, 4 * torch.pi, 30)  # twice around passes through -q
+    turns = torch.linspace(0, 4 * torch.pi, 30)  # two full turns pass through -q
     body = bending_body()
     root = torch.eye(4).repeat(30, 1, 1)
     root[:, 0, 0], root[:, 0, 1], root[:, 1, 0], root[:, 1, 1] = turns.cos(), -turns.sin(), turns.sin(), turns.cos()
@@ -124,6 +125,6 @@ def test_quaternions_do_not_jump(up: str) -> None:
     q = rig.motions["captured"].quaternions
     along = (q[1:] * q[:-1]).sum(-1)
     assert along.min() > 0.9
-    if up == "z":  # all of it is the root's: 4 pi / 29 = 0.433 rad a step, half of that on the sphere
+    if up == "z":  # the root has all of it: 4 pi / 29 = 0.433 rad a step, and half of that between quaternions
         np.testing.assert_allclose(along[:, 0], np.cos(0.433 / 2), atol=1e-3)
         np.testing.assert_allclose(along[:, 1], 1, atol=1e-9)

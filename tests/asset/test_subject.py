@@ -13,7 +13,7 @@ from tests.asset.figure import bending_body
 
 
 def made(folder: Path) -> Path:
-    """Return a subject's folder with the files that an export reads first, all empty."""
+    """Return a subject's folder with the files that an export reads first, all of them empty."""
     for name in exported.NEEDED:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).touch()
@@ -60,14 +60,14 @@ def test_an_unfinished_subject_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("preset", ["idr", "nerf", "nerfies", "paper"])
-def test_a_model_of_moments_has_no_asset(preset: str, tmp_path: Path) -> None:
-    """At rest, only what the body's box shares with the recorded moment would be left of it."""
+def test_a_model_of_single_moments_cannot_be_exported(preset: str, tmp_path: Path) -> None:
+    """In the rest pose, only the part of the recorded moment that lies in the body's box would remain."""
     with_model(made(tmp_path / "ada"), preset)
     with pytest.raises(InputError, match="new poses: train with preset fast, or with paper on several frames"):
         export_subject(tmp_path / "ada", AssetSettings(), [], tmp_path / "out", "")
 
 
-def test_masks_that_are_cut_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_masks_are_reported_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exported, "recording_of", lambda subject: "capture")
     monkeypatch.setattr(exported, "avatar_of", lambda subject: "avatar")
     with pytest.raises(InputError, match=r"ada/segmentation: damaged, or written by another version \("):

@@ -19,7 +19,7 @@ def layout(*uvs: tuple[float, float]) -> UvLayout:
     ("uvs", "tangent"),
     [
         (((0, 0), (1, 0), (1, 1), (0, 1)), (1, 0, 0, 1)),  # u along x, v along y
-        (((0, 0), (0, 1), (-1, 1), (-1, 0)), (0, -1, 0, 1)),  # a quarter turn: u falls along y
+        (((0, 0), (0, 1), (-1, 1), (-1, 0)), (0, -1, 0, 1)),  # a quarter turn: u decreases along y
         (((1, 0), (0, 0), (0, 1), (1, 1)), (-1, 0, 0, -1)),  # mirrored: N x T is -y, and v rises along y
     ],
 )
@@ -30,21 +30,21 @@ def test_tangents_of_a_square(uvs: tuple[tuple[float, float], ...], tangent: tup
 
 def test_a_tangent_is_at_right_angles_to_the_normal() -> None:
     lean = np.tile([0.6, 0, 0.8], (4, 1))
-    # x less its part along the normal: (1, 0, 0) - 0.6 (0.6, 0, 0.8) = (0.64, 0, -0.48), of length 0.8.
+    # x minus its component along the normal: (1, 0, 0) - 0.6 (0.6, 0, 0.8) = (0.64, 0, -0.48), of length 0.8.
     found = uv_tangents(SQUARE_M, lean, HALVES, layout((0, 0), (1, 0), (1, 1), (0, 1)))
     np.testing.assert_allclose(found, np.tile([0.8, 0, -0.6, 1], (4, 1)), atol=1e-12)
 
 
-def test_faces_count_by_their_angles() -> None:
+def test_tangents_average_faces_weighted_by_their_angles() -> None:
     points_m = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [-1, 1, 0]])
     shared = UvLayout(np.array([[0.0, 0], [1, 0], [1, 1], [1, 0], [0, 1]]), np.array([[0, 1, 2], [0, 3, 4]]))
     found = uv_tangents(points_m, UP, HALVES, shared)
-    # At the origin u rises along x in the first face, over 45 degrees, and along x + y in the second, over 90 degrees.
+    # At the origin, u rises along x in the first face, of 45 degrees, and along x + y in the second, of 90 degrees.
     expected = np.array([1, 0]) + 2 * np.array([1, 1]) / 2**0.5
     np.testing.assert_allclose(found[0, :2], expected / np.linalg.norm(expected), atol=1e-12)
 
 
-def test_a_coordinate_is_mirrored_as_the_greater_angle_is() -> None:
+def test_the_face_with_the_greater_angle_decides_the_mirroring() -> None:
     points_m = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [-1, 1, 0]])
     shared = UvLayout(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [1, 0]]), np.array([[0, 1, 2], [0, 3, 4]]))
     # As above, but the second face, of 90 degrees, is mirrored: there u rises along y - x.
@@ -53,7 +53,7 @@ def test_a_coordinate_is_mirrored_as_the_greater_angle_is() -> None:
     np.testing.assert_allclose(found[0], [*expected / np.linalg.norm(expected), 0, -1], atol=1e-12)
 
 
-def test_coordinates_without_area_have_some_tangent() -> None:
+def test_texture_coordinates_without_area_still_get_a_unit_tangent() -> None:
     found = uv_tangents(SQUARE_M, UP, HALVES, layout((0, 0), (0, 0), (0, 0), (0, 0)))
     np.testing.assert_allclose(np.linalg.norm(found[:, :3], axis=1), 1)
     np.testing.assert_allclose(found[:, 2], 0, atol=1e-12)
@@ -66,7 +66,7 @@ def test_components_of_a_direction() -> None:
     np.testing.assert_allclose(frame.components(np.array([[4.0, 3, 5]])), expected, atol=1e-12)
 
 
-def test_frames_inside_a_mirrored_face() -> None:
+def test_tangent_frames_inside_a_mirrored_face() -> None:
     mirrored = layout((1, 0), (0, 0), (0, 1), (1, 1))
     texels = Texels(torch.zeros(1), torch.zeros(1), torch.tensor([0]), torch.full((1, 3), 1 / 3))
     normals = normals_of(SQUARE_M, HALVES)

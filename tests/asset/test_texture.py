@@ -6,7 +6,7 @@ from hnerf.asset.texture import Texels, UvLayout, rasterise, texture_image, unwr
 
 
 def test_texels_of_one_triangle() -> None:
-    # Half of a 4 x 4 image: corners at the bottom left, bottom right and top left; v runs up, rows run down.
+    # The triangle covers half of a 4 x 4 image: bottom left, bottom right and top left. v points up, rows count down.
     layout = UvLayout(np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]]))
     texels = rasterise(layout, 4)
     at = {(r, c): b for r, c, b in zip(texels.row.tolist(), texels.column.tolist(), texels.barycentric, strict=True)}
@@ -16,9 +16,10 @@ def test_texels_of_one_triangle() -> None:
     torch.testing.assert_close(at[3, 2], torch.tensor([0.25, 0.625, 0.125]))
 
 
-def test_a_texel_belongs_to_the_face_around_its_centre() -> None:
-    """Two rectangles of two faces each meet at u = 0.4, 1.6 texels from the left, and end at u = 0.8, at 3.2: the
-    centres of columns 0 and 1 lie in the first, that of column 2 in the second, which touches columns 1 and 3 too."""
+def test_a_texel_belongs_to_the_face_that_contains_its_centre() -> None:
+    """Two rectangles of two faces each meet at u = 0.4, which is 1.6 texels from the left, and end at u = 0.8, at 3.2
+    texels. The centres of columns 0 and 1 lie in the first rectangle and that of column 2 in the second, which also
+    touches columns 1 and 3."""
     corners = [[u, v] for u in (0, 0.4, 0.8) for v in (0, 1)]
     layout = UvLayout(np.array(corners), np.array([[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]]))
     texels = rasterise(layout, 4)
@@ -32,8 +33,8 @@ def test_a_texel_belongs_to_the_face_around_its_centre() -> None:
 
 
 def test_texels_off_the_charts_repeat_the_nearest_border() -> None:
-    """Of 4 x 4, the first in the top row is red and the last in the bottom row blue: those nearer to red, with row and
-    column below 3 in all, and those nearer to blue."""
+    """In a 4 x 4 image, the first texel of the top row is red and the last of the bottom row blue. Texels whose row and
+    column add up to less than 3 are nearer to red, those with more to blue."""
     nowhere = torch.zeros(2, dtype=torch.long)
     ends = torch.tensor([0, 3])
     image = texture_image(Texels(ends, ends, nowhere, torch.zeros(2, 3)), np.array([[1.0, 0, 0], [0, 0, 0.6]]), 4)
@@ -41,7 +42,7 @@ def test_texels_off_the_charts_repeat_the_nearest_border() -> None:
     assert (image[row + column < 3] == (255, 0, 0)).all() and (image[row + column > 3] == (0, 0, 153)).all()
 
 
-def test_values_of_vertices_at_texels() -> None:
+def test_vertex_values_are_interpolated_at_texels() -> None:
     faces, values = np.array([[0, 1, 2], [2, 1, 3]]), np.array([[0.0, 1], [4, 1], [8, 1], [100, 1]])
     nowhere = torch.zeros(2, dtype=torch.long)
     texels = Texels(nowhere, nowhere, torch.tensor([1, 0]), torch.tensor([[0.5, 0.25, 0.25], [0.25, 0.5, 0.25]]))

@@ -11,8 +11,8 @@ from tests.asset.figure import column_rig, twice, upper_weight, upright_column
 
 
 def test_a_moved_mesh_does_not_cross_itself() -> None:
-    """Two boxes with 3 mm of air between them, of which one would be moved by 3.5 mm towards the other: what
-    would cross moves half of that."""
+    """Of two boxes 3 mm apart, one should move by 3.5 mm towards the other. Its vertices that would cross move only
+    half as far."""
     boxes = twice(trimesh.creation.box(extents=(0.02, 0.02, 0.02)), (0.023, 0.001, 0.001))
     rig = dataclasses.replace(
         column_rig(),
@@ -29,8 +29,9 @@ def test_a_moved_mesh_does_not_cross_itself() -> None:
     np.testing.assert_allclose(moved.vertices[8:, 0][facing], 0.013 - 0.00175, atol=1e-6)
 
 
-def test_eyes_go_with_the_registered_mesh() -> None:
-    """The field stands 2 cm to the left of the body: what follows the upper joint, as a ball its eye, goes there."""
+def test_eyeballs_and_eye_joints_move_with_the_registered_mesh() -> None:
+    """The field stands 2 cm to the left of the body. The vertices that follow the upper joint stand in for an eyeball,
+    and move there too."""
     rig = dataclasses.replace(column_rig(), joint_names=("root", "eye.L"))
     field = upright_column(0.15, 0.0, 1.6)
     field.vertices += (0.02, 0, 0)

@@ -11,7 +11,7 @@ from hnerf.asset.usd import define_camera, define_mesh
 from tests.asset.figure import side_camera
 
 
-def test_camera_numbers() -> None:
+def test_usd_camera_parameters_by_hand() -> None:
     stage = Usd.Stage.CreateInMemory()
     camera = define_camera(stage, Sdf.Path("/Camera"), side_camera(), stage_from_world("z"))
     # fx = 500 px of 640 across a gate of 0.36: 0.28125. H / fy x focal = 480 / 400 x 0.28125 = 0.3375.
@@ -26,7 +26,7 @@ def test_camera_numbers() -> None:
     np.testing.assert_allclose(pose, [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 1, 3, 1]], atol=1e-12)
 
 
-def test_camera_projects_where_ours_does() -> None:
+def test_usd_camera_projects_like_ours() -> None:
     ours, world = side_camera(), np.array([0.4, 0.7, 1.3])
     stage = Usd.Stage.CreateInMemory()
     frustum = define_camera(stage, Sdf.Path("/Camera"), ours, stage_from_world("z")).GetCamera().frustum
@@ -37,8 +37,9 @@ def test_camera_projects_where_ours_does() -> None:
     np.testing.assert_allclose(pixel, ours.project(world)[0], atol=1e-4)
 
 
-def test_a_seam_on_a_diagonal_parts_the_halves_of_a_quad(staged: StagedAvatar) -> None:
-    """A polygon has one texture coordinate a corner: across the seam, it would show what lies between two charts."""
+def test_a_texture_seam_on_the_diagonal_prevents_a_quad(staged: StagedAvatar) -> None:
+    """A polygon has one texture coordinate per corner, so across the seam it would show the texture between two
+    charts."""
     faces = np.array([[0, 1, 2], [2, 1, 3]])
     uvs = np.random.default_rng(0).random((6, 2)).astype(np.float32)
     for face_uvs, count in ((faces, 4), (np.arange(6).reshape(2, 3), 3)):

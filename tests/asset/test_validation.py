@@ -13,7 +13,7 @@ BODY = "/Avatar/Body"
 
 @pytest.fixture
 def stage(package: Path) -> Usd.Stage:
-    """Return a stage whose session layer can be damaged, and the metadata of its root layer."""
+    """Return a stage whose session layer, and whose root layer's metadata, a test can damage."""
     layer = Sdf.Layer.CreateAnonymous()
     whole = Sdf.Layer.FindOrOpen(str(package / "avatar.usdz"))
     layer.TransferContent(whole)
@@ -83,7 +83,7 @@ def small_hint(stage: Usd.Stage) -> None:
     UsdGeom.ModelAPI(stage.GetDefaultPrim()).SetExtentsHint([Gf.Vec3f(0), Gf.Vec3f(1)])
 
 
-# What damages a stage of three joints, by what is then said of it.
+# Functions that damage a stage of three joints, by the message that reports the defect.
 DAMAGE = {
     "do not sum to 1": lambda s: change(UsdSkel.BindingAPI(mesh(s)).GetJointWeightsAttr(), 0, 0.3),
     "joint index out of range": lambda s: change(UsdSkel.BindingAPI(mesh(s)).GetJointIndicesAttr(), 0, 3),
@@ -122,7 +122,7 @@ DAMAGE = {
     "extentsHint does not contain /Avatar/Body at time": small_hint,
     "has no extentsHint": lambda s: UsdGeom.ModelAPI(s.GetDefaultPrim()).GetExtentsHintAttr().Block(),
 }
-OF_ROOT_LAYER = {  # likewise, by metadata that only the root layer has
+OF_ROOT_LAYER = {  # likewise, for metadata that only the root layer has
     "metersPerUnit is 0.01": lambda s: UsdGeom.SetStageMetersPerUnit(s, 0.01),
     "assetInfo has no identifier": lambda s: s.GetDefaultPrim().ClearAssetInfoByKey("identifier"),
     "timeCodesPerSecond and framesPerSecond differ": lambda s: s.SetFramesPerSecond(24),
@@ -132,15 +132,16 @@ OF_ROOT_LAYER = {  # likewise, by metadata that only the root layer has
 
 
 @pytest.mark.parametrize("message", [*DAMAGE, *OF_ROOT_LAYER])
-def test_each_defect_is_named(stage: Usd.Stage, message: str) -> None:
+def test_each_defect_is_reported(stage: Usd.Stage, message: str) -> None:
     assert data_defects(stage) == []
     stage.SetEditTarget(stage.GetSessionLayer() if message in DAMAGE else stage.GetRootLayer())
     (DAMAGE | OF_ROOT_LAYER)[message](stage)
     assert message in "; ".join(data_defects(stage))
 
 
-def test_eyes_turn_about_the_middle_of_their_balls(stage: Usd.Stage) -> None:
-    """What follows the upper joint is 36 cm wide: its joint may be 10 % of 18 cm off the middle."""
+def test_an_eye_joint_off_the_centre_of_its_eyeball_is_reported(stage: Usd.Stage) -> None:
+    """The vertices that follow the upper joint are 36 cm wide, so the joint may be off their centre by 10 % of 18
+    cm."""
     stage.SetEditTarget(stage.GetSessionLayer())
     binding = UsdSkel.BindingAPI(mesh(stage))
     bound, weights = (np.array(a.Get()) for a in (binding.GetJointIndicesPrimvar(), binding.GetJointWeightsPrimvar()))
@@ -174,7 +175,7 @@ def test_a_game_rig_has_few_influences(stage: Usd.Stage) -> None:
 @pytest.mark.parametrize(
     ("lod", "shape", "allowed_m"), [("lod0", "captured", 0.001), ("lod1", "captured", 0.01), ("lod0", "stout", 0.01)]
 )
-def test_less_detail_and_other_shapes_may_stand_a_centimetre_off_the_ground(
+def test_coarse_levels_and_other_shapes_may_be_1_cm_off_the_ground(
     stage: Usd.Stage, lod: str, shape: str, allowed_m: float
 ) -> None:
     stage.SetEditTarget(stage.GetSessionLayer())
@@ -189,7 +190,7 @@ def test_less_detail_and_other_shapes_may_stand_a_centimetre_off_the_ground(
         assert ("not on the ground" in "; ".join(data_defects(stage))) is off
 
 
-def test_a_motion_at_another_rate_is_at_its_whole_frames(stage: Usd.Stage) -> None:
+def test_a_motion_not_sampled_at_its_whole_frames_is_reported(stage: Usd.Stage) -> None:
     stage.SetEditTarget(stage.GetSessionLayer())
     stage.GetDefaultPrim().GetVariantSet("motion").SetVariantSelection("captured_24")
     assert data_defects(stage) == []
@@ -200,8 +201,8 @@ def test_a_motion_at_another_rate_is_at_its_whole_frames(stage: Usd.Stage) -> No
 
 
 def test_other_shapes_are_checked_in_the_motion_that_the_file_selects() -> None:
-    """USD sorts names: a motion of Ben's comes before the captured one. Of two by two combinations, that of his motion
-    and the stout shape differs twice."""
+    """USD sorts names, so Ben's motion comes before the captured one. Of the two by two combinations, Ben's motion with
+    the stout shape is skipped because it differs from the default in both."""
     stage = Usd.Stage.CreateInMemory()
     stage.SetDefaultPrim(stage.DefinePrim("/Avatar"))
     for name, variants in {"shape": ("captured", "stout"), "motion": ("captured", "ben")}.items():
@@ -221,7 +222,7 @@ def test_what_we_write_passes_every_validator(package: Path) -> None:
         assert report["validators"] >= 30
 
 
-def test_both_topologies_pass_every_validator_and_a_defect_of_one_says_of_which(both: Path, tmp_path: Path) -> None:
+def test_both_topologies_pass_every_validator_and_a_defect_names_its_topology(both: Path, tmp_path: Path) -> None:
     for name in ("avatar.usdz", "avatar.usda"):
         report = validate_package(both / name)
         assert (report["variants"], report["warnings"]) == (20 + 12, [])
@@ -236,7 +237,7 @@ def test_both_topologies_pass_every_validator_and_a_defect_of_one_says_of_which(
     assert "topology=registered" not in str(e.value)
 
 
-def test_a_defect_in_one_variant_says_in_which(package: Path, tmp_path: Path) -> None:
+def test_a_defect_is_reported_with_its_variant(package: Path, tmp_path: Path) -> None:
     shutil.copytree(package, tmp_path / "copy")
     motion = Usd.Stage.Open(str(tmp_path / "copy/avatar/motion_captured_30.usdc"))
     UsdSkel.Animation(motion.GetPrimAtPath(f"{BODY}/Motion/game")).GetBlendShapeWeightsAttr().Set([2.0] * 3, 9.0)
@@ -249,7 +250,7 @@ def test_a_defect_in_one_variant_says_in_which(package: Path, tmp_path: Path) ->
 
 
 def test_an_error_of_usd_itself_raises(package: Path, tmp_path: Path) -> None:
-    """Give a loose layer without its texture beside it."""
+    """The layer is exported without its texture next to it."""
     whole = Usd.Stage.Open(str(package / "avatar.usdz"))
     whole.GetRootLayer().Export(str(tmp_path / "loose.usdc"))
     with pytest.raises(InvalidAsset, match=r"loose\.usdc"):

@@ -1,4 +1,4 @@
-"""The page of the avatar: what is in it, and, where a browser is installed, what it does."""
+"""The avatar's viewer page: its contents and, if a browser is installed, its behaviour."""
 
 import base64
 import dataclasses
@@ -33,7 +33,7 @@ PICTURE = "(viewer.stage.render(), document.getElementById('canvas').toDataURL()
 
 @pytest.fixture(scope="module")
 def photographed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """Return the capture of one camera with grey pictures."""
+    """Return the capture of one camera with grey images."""
     root = tmp_path_factory.mktemp("capture")
     (root / "images" / "01").mkdir(parents=True)
     for frame in FRAMES:
@@ -43,7 +43,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 @pytest.fixture(scope="module")
 def viewer(staged: StagedAvatar, photographed: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write the page of an avatar whose vertices are moved by their fifth joint and later ones alone."""
+    """Write the page of an avatar whose vertices are moved only by their fifth and later joints."""
     folder = tmp_path_factory.mktemp("viewer")
     glb = folder / "avatar.glb"
     write_avatar(glb, staged)
@@ -62,11 +62,11 @@ def page(viewer: Path) -> Iterator[Page]:
     with browser(program) as opened:
         opened.open(viewer, 1000, 640)
         opened.wait("window.viewer !== undefined")
-        opened.evaluate("document.getElementById('follow').click()")  # it would move the camera between pictures
+        opened.evaluate("document.getElementById('follow').click()")  # following would move the camera between images
         yield opened
 
 
-def test_without_three_there_is_a_reason_and_no_page(
+def test_without_three_js_a_reason_is_given_and_no_page_is_written(
     staged: StagedAvatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
@@ -78,7 +78,7 @@ def test_without_three_there_is_a_reason_and_no_page(
 def test_cameras_and_photographs_are_in_the_avatars_world(photographed: Capture, staged: StagedAvatar) -> None:
     found = recording(photographed, staged.stage_from_world)
     (camera,) = found["cameras"]
-    # At (0, -3, 1) of a world with z up, looking along +y: at (0, 1, 3) with y up, looking along -z.
+    # At (0, -3, 1) of a world with z up, looking along +y. With y up that is at (0, 1, 3), looking along -z.
     np.testing.assert_allclose(camera["pose"], [1, 0, 0, 0, 0, 1, 0, 1, 0, 0, 1, 3, 0, 0, 0, 1], atol=1e-12)
     assert {key: camera[key] for key in ("fx", "fy", "cx", "cy")} == {"fx": 500, "fy": 400, "cx": 300, "cy": 200}
     assert (found["fps"], found["first_frame"]) == (10, 3)
@@ -102,10 +102,10 @@ def test_every_import_is_in_the_page(viewer: Path) -> None:
 
 
 @NEEDS_THREE
-def test_a_page_is_packed_once_a_size_of_its_texture(
+def test_a_page_is_packed_once_per_texture_size(
     viewer: Path, photographed: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The avatar's texture has 64 px: three of the sizes are no smaller."""
+    """The avatar's texture has 64 px, so sizes 256, 128 and 64 give the same page; 32 and 16 give two more."""
     packed: list[bytes] = []
     monkeypatch.setattr("hnerf.asset.viewer._packed", lambda content: packed.append(content) or "")
     monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", 1)
@@ -137,14 +137,14 @@ def test_a_page_that_is_too_large_gets_a_smaller_texture(
 
 
 @NEEDS_THREE
-def test_it_opens_without_a_complaint_or_a_request(page: Page, viewer: Path) -> None:
+def test_the_page_opens_without_console_warnings_or_requests(page: Page, viewer: Path) -> None:
     page.evaluate("new Promise(requestAnimationFrame)")
     assert page.complaints() == []
     assert page.requests() == [viewer.as_uri()]
 
 
 @NEEDS_THREE
-def test_it_plays_and_pauses(page: Page) -> None:
+def test_the_page_plays_and_pauses_the_motion(page: Page) -> None:
     before = page.evaluate(LAST_JOINT + ".matrixWorld.elements.slice()")
     page.evaluate("viewer.play(true)")
     page.wait(f"{LAST_JOINT}.matrixWorld.elements.some((value, i) => value !== {before}[i])")
@@ -194,12 +194,12 @@ def test_the_person_is_framed_from_the_front(page: Page, staged: StagedAvatar) -
     np.testing.assert_allclose([low, high], [staged.points_m[0].min(0), staged.points_m[0].max(0)], atol=5e-5)
     ground_m = sorted(staged.points_m[..., 1].min(1))
     x, _, z = page.evaluate("viewer.bounds.forward.toArray()")
-    assert math.atan2(x, z) == pytest.approx(0.8 * FRAMES[0])  # as the root turns about the vertical, from +z
+    assert math.atan2(x, z) == pytest.approx(0.8 * FRAMES[0])  # the root's turn about the vertical, from +z
     assert ground_m[0] - 0.02 < page.evaluate("viewer.bounds.ground") < ground_m[-1] + 0.02
 
 
 @NEEDS_THREE
-def test_the_rest_pose_is_that_of_the_file(page: Page, staged: StagedAvatar) -> None:
+def test_the_rest_pose_moves_no_vertices(page: Page, staged: StagedAvatar) -> None:
     page.evaluate("viewer.setTime(0.2)")
     page.evaluate("viewer.setMotion(viewer.avatar.motions.length)")
     inverse = "viewer.avatar.inverses.get(joint)"
@@ -210,10 +210,10 @@ def test_the_rest_pose_is_that_of_the_file(page: Page, staged: StagedAvatar) -> 
 
 
 @NEEDS_THREE
-def test_a_recorded_camera_shows_the_avatar_where_the_recording_has_it(page: Page, staged: StagedAvatar) -> None:
+def test_a_recorded_camera_shows_the_avatar_over_its_photograph(page: Page, staged: StagedAvatar) -> None:
     page.evaluate("viewer.setTime(0.19)")
     page.click("#cameras label:nth-child(2)")
-    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.2)  # of the nearest photograph
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.2)  # the time of the nearest photograph
     caption = "document.getElementById('caption').textContent"
     assert page.evaluate(caption) == "Photograph of frame 5"
     page.evaluate("viewer.setTime(0.26)")
@@ -237,7 +237,7 @@ def test_a_recorded_camera_shows_the_avatar_where_the_recording_has_it(page: Pag
 
 
 def outline(world_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return where the side camera sees a surface, (480, 640) bool."""
+    """Return the pixels where the side camera sees a surface, (480, 640) bool."""
     camera = side_camera()
     pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
     origins, directions = camera.rays(pixels.reshape(-1, 2))
