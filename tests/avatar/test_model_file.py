@@ -13,7 +13,8 @@ from tests.fields.plain_grids import everywhere
 
 
 def small_field(cells: int = 4) -> nn.Module:
-    """Return a field with a grid of 2 x 3 x 5 nodes (x, y, z) with two features, or a finer one, and a number."""
+    """Return a field with a scalar parameter and a grid of 2 x 3 x 5 nodes (x, y, z) with two features; other `cells`
+    give another resolution."""
     field = nn.Module()
     field.grids = SparseGrids(torch.zeros(3), torch.tensor([1.0, 2.0, 4.0]), (cells,), 2, everywhere)
     field.sharpness = nn.Parameter(torch.tensor(1 / 3))
@@ -27,8 +28,9 @@ def written_and_read(learned: nn.Module, path: Path) -> nn.Module:
     return read
 
 
-def test_a_grid_is_stored_in_steps_of_a_127th_of_its_greatest_feature(tmp_path: Path):
-    """-12.7 makes the step 0.1, so 3.14 is 31 steps and 0.04 none; the number beside the grid stays as it is."""
+def test_grid_features_are_quantised_to_a_127th_of_the_largest(tmp_path: Path):
+    """With a largest feature of -12.7 the step is 0.1, so 3.14 is stored as 31 steps and 0.04 as none. The scalar is
+    stored exactly."""
     learned = small_field()
     features = torch.zeros(5, 3, 2, 2)
     features[3, 2, 1, 1], features[0, 0, 0, 0], features[4, 1, 0, 0] = -12.7, 3.14, 0.04
@@ -39,13 +41,14 @@ def test_a_grid_is_stored_in_steps_of_a_127th_of_its_greatest_feature(tmp_path: 
     assert read.sharpness == learned.sharpness
 
 
-def test_a_grid_that_has_learned_nothing_comes_back_empty(tmp_path: Path):
+def test_an_untrained_grid_is_loaded_as_zeros(tmp_path: Path):
     read = written_and_read(small_field(), tmp_path / "model.safetensors")
     assert read.grids.features.count_nonzero() == 0
 
 
-def test_nodes_that_nothing_was_learned_of_take_no_room(tmp_path: Path):
-    """A tenth of 41 x 21 x 11 nodes of 2 features has random values: less than 3 bytes per node of those."""
+def test_untrained_grid_nodes_take_almost_no_space(tmp_path: Path):
+    """A tenth of 41 x 21 x 11 nodes with 2 features have random values. The file has fewer than 3 bytes for each of
+    these nodes."""
     learned, path = small_field(cells=40), tmp_path / "model.safetensors"
     (nodes,) = learned.grids.dense_levels()
     nodes[:4] = torch.rand(nodes[:4].shape, generator=torch.Generator().manual_seed(0))
@@ -64,7 +67,7 @@ def test_nodes_that_nothing_was_learned_of_take_no_room(tmp_path: Path):
         lambda stored: stored.update({"grids.levels.0.steps": torch.arange(20, dtype=torch.uint8)}),
     ],
 )
-def test_what_lacks_a_part_or_is_damaged_is_of_another_version(tmp_path: Path, damage: Callable[[dict], object]):
+def test_incomplete_or_damaged_files_are_refused_as_another_version(tmp_path: Path, damage: Callable[[dict], object]):
     path = tmp_path / "model.safetensors"
     write_field(small_field(), path)
     stored = load_file(path)
@@ -74,7 +77,7 @@ def test_what_lacks_a_part_or_is_damaged_is_of_another_version(tmp_path: Path, d
 
 
 @pytest.mark.parametrize("cells", [2, 8])
-def test_a_grid_of_another_size_is_of_another_version(tmp_path: Path, cells: int):
+def test_a_grid_of_another_size_is_refused_as_another_version(tmp_path: Path, cells: int):
     path = tmp_path / "model.safetensors"
     write_field(small_field(cells), path)
     with pytest.raises(InputError, match=r"written by another version"):

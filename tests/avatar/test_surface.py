@@ -19,7 +19,7 @@ def sphere(points_m: Tensor, radius_m: float = 0.4) -> Tensor:
     return points_m.norm(dim=1) - radius_m
 
 
-def test_sphere_has_its_radius_and_volume_and_turns_outwards() -> None:
+def test_an_extracted_sphere_has_its_radius_and_outward_faces() -> None:
     mesh = extract_surface(sphere, LOWER_M, UPPER_M, 64)
     assert mesh.is_watertight
     # A chord of one cell (31 mm) sags (31 mm)^2 / (8 x 0.4 m) = 0.3 mm between the grid's nodes.
@@ -27,10 +27,10 @@ def test_sphere_has_its_radius_and_volume_and_turns_outwards() -> None:
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=0.01)
 
 
-def test_skipping_empty_space_finds_the_dense_surface_with_a_fraction_of_the_queries() -> None:
+def test_skipping_empty_space_gives_the_dense_surface_with_fewer_queries() -> None:
     queries = 0
 
-    def bumpy(points_m: Tensor) -> Tensor:  # slope up to 1 + 0.03 x 25 = 1.75: not a true distance
+    def bumpy(points_m: Tensor) -> Tensor:  # its slope is up to 1 + 0.03 x 25 = 1.75, so it is no true distance
         nonlocal queries
         queries += len(points_m)
         return sphere(points_m) + 0.03 * torch.sin(25 * points_m[:, 0])
@@ -44,7 +44,7 @@ def test_skipping_empty_space_finds_the_dense_surface_with_a_fraction_of_the_que
     np.testing.assert_array_equal(mesh.faces, faces)
 
 
-def test_only_the_largest_component_stays() -> None:
+def test_only_the_largest_component_is_kept() -> None:
     def two_spheres(points_m: Tensor) -> Tensor:
         return torch.minimum(sphere(points_m, 0.3), sphere(points_m - torch.tensor([0, 0, 0.7]), 0.1))
 
@@ -52,14 +52,14 @@ def test_only_the_largest_component_stays() -> None:
     assert mesh.vertices[:, 2].max() == pytest.approx(0.3, abs=0.002)
 
 
-def test_the_largest_component_is_that_of_the_greatest_area() -> None:
-    """A cube of 12 faces and 6 m2 beside a ball of 80 faces and about .12 m2."""
+def test_the_largest_component_is_chosen_by_area() -> None:
+    """A cube with 12 faces and 6 m2 next to a ball with 80 faces and about 0.12 m2."""
     cube, ball = trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(1, 0.1).apply_translation([3, 0, 0])
     assert _largest_component(trimesh.util.concatenate([ball, cube])).area == pytest.approx(6)
 
 
 def test_clothes_18_cm_off_the_body_are_meshed() -> None:
-    """The distance is that to the unit box of the body, and 18 cm around it."""
+    """The surface lies 18 cm outside the unit box that is the body."""
 
     def distance(points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         return torch.maximum(-points_m, points_m - 1).amax(-1) - 0.18
@@ -79,8 +79,8 @@ def test_a_field_without_a_closed_surface_is_refused(offset_m: float, message: s
 
 
 def test_normals_and_distances_by_hand() -> None:
-    """Of 6 + 3 y + 4 z at (1, 2, 3), and of the squared distance from the origin at (0, 0, 2): half a metre around it,
-    in four directions that cancel out, that is 2^2 + (1/2)^2 on average."""
+    """The first function is 6 + 3 y + 4 z at (1, 2, 3). The second is the squared distance from the origin at (0, 0,
+    2): sampled half a metre away in four directions that cancel out, its mean is 2^2 + (1/2)^2."""
 
     def plane(points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         return 6 + points_m @ torch.tensor([0.0, 3, 4])
@@ -99,7 +99,7 @@ def test_normals_and_distances_by_hand() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 3])
-def test_normals_pose_the_body_once(count: int) -> None:
+def test_normals_need_a_single_query(count: int) -> None:
     asked: list[int] = []
 
     def height(points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:

@@ -52,15 +52,15 @@ def test_a_field_without_its_body_is_refused(subject: Path):
 
 
 @pytest.mark.parametrize("bf16", [False, True])
-def test_both_networks_of_the_paper_multiply_as_the_settings_say(tmp_path: Path, bf16: bool) -> None:
+def test_both_networks_of_the_paper_use_the_bf16_setting(tmp_path: Path, bf16: bool) -> None:
     changes = {"field": {"kind": "paper", "bf16": bf16}}
     field = build_field(TrainingSettings.model_validate(changes).field, record(tmp_path)[2], False)
     assert isinstance(field, PaperField)
     assert field.radiance.trunk.bf16 is field.residual.trunk.bf16 is bf16
 
 
-def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path, monkeypatch: pytest.MonkeyPatch):
-    """Eight samples per ray, and a limit of 2048 samples."""
+def test_ray_batches_are_limited_by_their_number_of_samples(subject: Path, monkeypatch: pytest.MonkeyPatch):
+    """Rays have eight samples, and a batch may have 2048 samples."""
     capture, _, body = record(subject / "capture")
     avatar, at_once = load_avatar(subject), []
     look = avatar.field.render_rays
@@ -75,8 +75,8 @@ def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path
     assert len(at_once) > 1 and at_once[0] == max(at_once) == 256
 
 
-def test_of_frames_in_one_posture_the_one_that_stands_there_is_shown():
-    """Two frames have the same joint angles, a metre apart; 40 cm from the first is nearer to it."""
+def test_of_frames_in_the_same_pose_the_one_nearest_in_position_is_used():
+    """Two frames have the same joint angles and are 1 m apart. A place 40 cm from the first is nearer to it."""
     theta, root = torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1)
     root[1, 0, 3] = 1.0
     body = BodyFit(box_rig(), (0, 1), theta, root)

@@ -1,5 +1,5 @@
-"""A recording that a static method learns in seconds: a ball, coloured by its normal, before a grey plate. The body
-fitted to it is a unit box, so that only its extent says anything about the ball."""
+"""A recording that a static method learns in seconds: a ball, coloured by its normal, in front of a grey background.
+The body fitted to it is a unit box, so only its extent reveals anything about the ball."""
 
 import dataclasses
 from pathlib import Path
@@ -23,7 +23,7 @@ RING = tuple("01234567")  # every 45 degrees
 
 
 def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Render the ball from a camera: colour (H, W, 3) in [0, 255], black elsewhere; mask (H, W)."""
+    """Render the ball from a camera: colour (H, W, 3) in [0, 255], black outside the ball, and mask (H, W)."""
     y, x = np.mgrid[:SIZE_PX, :SIZE_PX]
     origins, directions = camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
     points_on_rays = ((MIDDLE_M - origins) * directions).sum(1)
@@ -36,12 +36,12 @@ def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def body() -> BodyFit:
-    """Return the unit box that stands for the ball's body."""
+    """Return a unit box as the fitted body of the ball."""
     return BodyFit(box_rig(splits=4), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
 
 
 def record(folder: Path) -> tuple[Capture, Masks, BodyFit]:
-    """Write the recording of one frame to `folder`; eight cameras, all of them for training."""
+    """Write a recording of one frame from eight training cameras to `folder`."""
     cameras, masks = {}, {}
     for k, name in enumerate(RING):
         turn = k * np.pi / 4
@@ -56,7 +56,7 @@ def record(folder: Path) -> tuple[Capture, Masks, BodyFit]:
 
 
 def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) -> TrainedAvatar:
-    """Train on the ball from some of the ring's cameras."""
+    """Train on the ball with the given cameras of the ring."""
     capture, masks, fit = record(folder / "capture")
     capture = dataclasses.replace(capture, train_cameras=cameras)
     (folder / "out").mkdir()
@@ -65,7 +65,7 @@ def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) 
 
 
 def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:
-    """Return the PSNR of the whole image of a camera of the ring, over black."""
+    """Return the PSNR of a ring camera's whole image, rendered over black."""
     camera = record(folder / "capture")[0].cameras[name]
     drawn = avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
     wanted = torch.from_numpy(render(camera)[0] / 255).float()
@@ -73,8 +73,8 @@ def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:
 
 
 def inner_psnr(avatar: TrainedAvatar, folder: Path, name: str) -> tuple[float, float]:
-    """Return the PSNR of the ball's colours two or more pixels inside its outline, and that of a single colour for all
-    of them."""
+    """Return the PSNR of the ball's colours at least two pixels inside its outline, and the PSNR of their mean colour
+    there."""
     camera = record(folder / "capture")[0].cameras[name]
     colour, mask = render(camera)
     inside = torch.from_numpy(cv2.erode(mask.astype(np.uint8), np.ones((5, 5))) > 0)

@@ -1,4 +1,4 @@
-"""Training of a dynamic method, in seconds, on the bending column (tests/training/scene.py): two frames, four
+"""Train a dynamic method in seconds on the bending column (tests/training/scene.py) with two frames and four
 cameras."""
 
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ class Learned:
     body: BodyFit
     avatar: TrainedAvatar
 
-    @cache  # noqa: B019 the few there are live as long as their tests
+    @cache  # noqa: B019 there are few instances, which live as long as their tests
     def psnr(self, frame: int) -> float:
-        """Return the PSNR of a frame's photographs, rendered over their plate, all cameras together."""
+        """Return the PSNR of a frame over all cameras, rendered over the photographs' background."""
         errors = []
         for name, camera in self.capture.cameras.items():
             drawn = self.avatar.render(camera, self.body.theta[frame], self.body.root[frame])
@@ -38,7 +38,7 @@ class Learned:
 
 
 def learn(folder: Path, settings: TrainingSettings, bends_rad: tuple[float, float, float]) -> Learned:
-    """Train on the column bent as in the first two frames; the third is a novel pose."""
+    """Train on the column, bent by the first two angles; the third angle is a novel pose."""
     capture, masks, body = record(folder / "capture", bends_rad)
     (folder / "out").mkdir()
     train(capture, masks, body, settings, folder / "out", ALONE)
@@ -46,7 +46,7 @@ def learn(folder: Path, settings: TrainingSettings, bends_rad: tuple[float, floa
 
 
 def three_poses() -> BodyFit:
-    """Return the column upright and bent, as a fit of three frames."""
+    """Return the column as a fit of three frames: upright, and bent by 0.3 and 0.6 rad."""
     theta = torch.zeros(3, 2, 3)
     theta[:, 1, 1] = torch.tensor([0.0, 0.3, 0.6])
     return BodyFit(box_rig(bend_segments=6, splits=2), (0, 1, 2), theta, torch.eye(4).repeat(3, 1, 1))

@@ -16,7 +16,7 @@ SMALL = [
     "training.field.samples=16",
     "training.field.learning_rate=0.003",
 ]
-FEWER = ["training.steps=100", "training.rays_per_frame=96"]  # for two pictures
+FEWER = ["training.steps=100", "training.rays_per_frame=96"]  # for training on two images
 AXES = torch.cat([torch.eye(3), -torch.eye(3)])
 
 
@@ -26,16 +26,16 @@ def sphere(points: Tensor) -> Tensor:
 
 
 def traced(distance, origins: Tensor, directions: Tensor, samples: int = 16) -> tuple[Tensor, Tensor]:
-    """Trace between depths 0 and 8."""
+    """Trace rays between depths 0 and 8."""
     near, far = torch.zeros(len(origins)).to(origins), torch.full((len(origins),), 8.0).to(origins)
     probe_depths = torch.linspace(0, 8, samples).to(origins).expand(len(origins), -1)
     rays = Rays(origins, directions, torch.zeros(len(origins), dtype=torch.long))
     return trace_surface(distance, rays, near, far, probe_depths, distance(rays.points(probe_depths)))
 
 
-def test_rays_meet_the_unit_sphere_where_geometry_says() -> None:
-    """From x = -3: through the middle at 2, 0.6 beside it at 3 - 0.8, never 1.5 beside it or away from it; from inside
-    the sphere no ray enters it."""
+def test_rays_hit_the_unit_sphere_at_exact_depths() -> None:
+    """Rays start at x = -3. One through the centre hits at depth 2, one 0.6 off the centre at 3 - 0.8; one 1.5 off or
+    pointing away never hits. A ray from inside the sphere does not enter it."""
     origins = torch.tensor([[-3.0, 0, 0], [-3, 0.6, 0], [-3, 1.5, 0], [-3, 0, 0], [0, 0, 0]])
     directions = torch.tensor([[1.0, 0, 0], [1, 0, 0], [1, 0, 0], [-1, 0, 0], [1, 0, 0]])
     depth, hit = traced(sphere, origins, directions)
@@ -44,16 +44,16 @@ def test_rays_meet_the_unit_sphere_where_geometry_says() -> None:
 
 
 @pytest.mark.parametrize("slope", [0.05, 2.0])
-def test_the_secant_mends_what_tracing_cannot(slope: float) -> None:
-    """Distances twenty times too small stop tracing early, twice too large ones take it to the far side. The sampled
-    signs reveal the crossing."""
+def test_the_secant_method_corrects_failed_sphere_tracing(slope: float) -> None:
+    """Distances twenty times too small stop tracing early; twice too large, they lead to the far side. The signs at the
+    samples reveal the crossing."""
     origins, directions = torch.tensor([[-3.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]])
     depth, hit = traced(lambda x: slope * sphere(x), origins, directions)
     assert hit.all() and depth.item() == pytest.approx(2.0, abs=1e-3)
 
 
-def test_the_first_of_two_surfaces_is_met() -> None:
-    """Two unit spheres at x = 0 and x = 3.5."""
+def test_rays_hit_the_first_of_two_surfaces() -> None:
+    """The surfaces are unit spheres at x = 0 and x = 3.5."""
     apart = torch.tensor([3.5, 0, 0])
     depth, hit = traced(
         lambda x: torch.minimum(sphere(x), sphere(x - apart)),
@@ -64,9 +64,9 @@ def test_the_first_of_two_surfaces_is_met() -> None:
     torch.testing.assert_close(depth, torch.tensor([2.2, 2.7]), atol=2e-4, rtol=0)
 
 
-def test_the_intersection_moves_as_the_traced_point_does() -> None:
-    """Equation 3 against central differences of tracing again, for the sphere's radius and middle, in double precision;
-    by hand, through the middle, dx/dr = -v."""
+def test_gradients_of_the_intersection_match_finite_differences() -> None:
+    """Equation 3 agrees with central differences of the exact intersection, for the sphere's radius and centre, in
+    double precision. By hand, through the centre, dx/dr = -v."""
     origins = torch.tensor([[-3.0, 0.0, 0.0], [-3.0, 0.6, 0.2]], dtype=torch.float64)
     directions = torch.nn.functional.normalize(
         torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.05, -0.1]], dtype=torch.float64), dim=-1
@@ -106,8 +106,8 @@ def test_the_intersection_moves_as_the_traced_point_does() -> None:
     assert radius.grad is not None and radius.grad.item() == pytest.approx(-1.0)
 
 
-def test_starts_as_a_sphere() -> None:
-    """From the centre outwards every direction leaves the surface once, on average at the radius."""
+def test_the_untrained_network_is_a_sphere() -> None:
+    """Every ray from the centre outwards leaves the surface once, on average at the radius."""
     torch.manual_seed(0)
     network = SdfNetwork(64, 0.4)
     directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
@@ -118,8 +118,8 @@ def test_starts_as_a_sphere() -> None:
 
 
 def test_overfits_the_ball(tmp_path: Path) -> None:
-    """With eight views: 23 dB in a training view, its colours 5 dB better than a single colour, and along the axes the
-    surface within 4 cm of the ball's 35."""
+    """With eight views, a training view has 23 dB, and its colours are 5 dB better than a single colour. Along the
+    axes, the surface is within 4 cm of the ball's radius of 35 cm."""
     avatar = trained(tmp_path, load_settings("idr", SMALL).training, RING)
     assert psnr(avatar, tmp_path, "0") > 23
     colours, one_colour = inner_psnr(avatar, tmp_path, "0")
@@ -127,8 +127,8 @@ def test_overfits_the_ball(tmp_path: Path) -> None:
     assert (radii_m(avatar, AXES) - RADIUS_M).abs().max() < 0.04
 
 
-def test_two_opposite_views_say_nothing_of_the_depth_between(tmp_path: Path) -> None:
-    """Cameras on the x axis see the same outline whatever the depth: a view from between them loses at least 4 dB."""
+def test_two_opposite_views_do_not_determine_the_depth_between(tmp_path: Path) -> None:
+    """Cameras on the x axis see the same outline whatever the depth, so a view from the side is at least 4 dB worse."""
     avatar = trained(tmp_path, load_settings("idr", SMALL + FEWER).training, ("0", "4"))
     assert psnr(avatar, tmp_path, "0") > 20
     assert psnr(avatar, tmp_path, "2") < psnr(avatar, tmp_path, "0") - 4

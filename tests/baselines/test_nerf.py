@@ -27,18 +27,18 @@ SMALL = [
     "training.field.samples=16",
     "training.field.learning_rate=0.015",
 ]
-FEWER = ["training.steps=150", "training.rays_per_frame=96"]  # for two pictures
+FEWER = ["training.steps=150", "training.rays_per_frame=96"]  # for training on two images
 
 
 class Fog(torch.nn.Module):
-    """Network with the same output everywhere."""
+    """A network with the same output everywhere."""
 
     def __init__(self, density: float, grey: float):
         super().__init__()
-        self.said = density, grey
+        self.outputs = density, grey
 
     def forward(self, point: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.full_like(point[..., 0], self.said[0]), torch.full_like(point, self.said[1])
+        return torch.full_like(point[..., 0], self.outputs[0]), torch.full_like(point, self.outputs[1])
 
 
 class Roomy(NerfField):
@@ -47,15 +47,15 @@ class Roomy(NerfField):
 
 @pytest.fixture
 def fog() -> NerfField:
-    """Return a field over the unit box with a margin of 0.5 m, whose half edge is 1 m; the coarse fog is thin and dark,
-    the fine one dense and bright."""
+    """Return a field over the unit box with a margin of 0.5 m, so its half edge is 1 m. The coarse fog is thin and
+    dark, the fine one dense and bright."""
     field = Roomy(body(), load_settings("nerf").training.field)
     field.coarse, field.fine = Fog(0.5, 0.25), Fog(2.0, 0.75)
     return field
 
 
 def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
-    """Render one ray through the middle of the box, 2 m inside it, over white, and another that misses it."""
+    """Sample two rays over white: one through the middle of the box, 2 m of it inside, and one that misses it."""
     fit = body()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
@@ -65,9 +65,9 @@ def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
     return field.sample(field.scene(bodies, conditions), rays, draws)
 
 
-def test_both_colours_by_hand(fog: NerfField) -> None:
-    """Strata of 2 m / 24 with their samples at the start: both networks see the whole 2 m. Fine 0.75 (1 - e^-4) + e^-4,
-    coarse 0.25 (1 - e^-1) + e^-1; the ray that misses the box sees white."""
+def test_coarse_and_fine_colours_by_hand(fog: NerfField) -> None:
+    """Samples lie at the start of strata of 2 m / 24, so both networks see the whole 2 m. Fine: 0.75 (1 - e^-4) + e^-4;
+    coarse: 0.25 (1 - e^-1) + e^-1. The ray that misses the box sees white."""
     still = Draws.deterministic(2, 24, torch.device("cpu"))
     zero = torch.zeros(2, 24)
     samples, depths = look(fog, dataclasses.replace(still, jitter=zero, fine=zero))
@@ -79,9 +79,9 @@ def test_both_colours_by_hand(fog: NerfField) -> None:
     assert depths[0, 0].item() == pytest.approx(2.5)  # the box starts at x = -0.5
 
 
-def test_fine_samples_crowd_where_the_coarse_network_saw_something(fog: NerfField) -> None:
-    """The coarse network sees an opaque wall from 4 m on: the 24 fine samples lie in the cell where it begins, which
-    extends half-way to the samples beside it, 2 m / 24 apart."""
+def test_fine_samples_concentrate_where_the_coarse_network_has_density(fog: NerfField) -> None:
+    """The coarse network has an opaque wall from 4 m on. The 24 fine samples lie in the cell where it begins, which
+    extends half-way to the neighbouring samples, 2 m / 24 apart."""
 
     class Wall(Fog):
         def forward(self, point: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,7 +94,8 @@ def test_fine_samples_crowd_where_the_coarse_network_saw_something(fog: NerfFiel
 
 
 def test_the_surface_is_where_the_density_is_sigma_h(fog: NerfField) -> None:
-    """With a half edge of 1 m sigma_h is 20 a unit: 0 there, BAND_M in empty space, -BAND_M / 3 at twice sigma_h."""
+    """With a half edge of 1 m, sigma_h is 20 per unit. The distance is 0 there, BAND_M in empty space and -BAND_M / 3
+    at twice sigma_h."""
     fit = body()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, fog.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
@@ -102,12 +103,13 @@ def test_the_surface_is_where_the_density_is_sigma_h(fog: NerfField) -> None:
         fog.fine = Fog(density, 0)
         found = fog.signed_distance(bodies, torch.full((1, 3), 0.5), conditions)
         assert found.item() == pytest.approx(distance, abs=1e-7)
-    outside = torch.tensor([[4.5, 4.5, 0.5]])  # 3 m and 3 m beyond the box: dense or not, nothing is there
+    outside = torch.tensor([[4.5, 4.5, 0.5]])  # 3 m beyond the box along x and y: the density does not count here
     assert fog.signed_distance(bodies, outside, conditions).item() == pytest.approx(3 * 2**0.5, rel=1e-6)
 
 
 def test_distance_to_a_box_by_hand() -> None:
-    """A box of 2 m: 1 m deep in the middle, 0.25 m near a face, 1 m before a face, the root of 3 from a corner."""
+    """For a box of 2 m: 1 m deep at the centre, 0.25 m deep near a face, 1 m outside a face, sqrt(3) m from a
+    corner."""
     boxes = Boxes(torch.full((1, 3), -1.0), torch.ones(1, 3))
     points = torch.tensor([[0.0, 0, 0], [0.75, 0, 0], [0, -2, 0], [2, 2, 2]])
     torch.testing.assert_close(boxes.signed_distance(points), torch.tensor([-1.0, -0.25, 1.0, 3**0.5]))
@@ -120,16 +122,16 @@ def test_more_than_one_moment_is_refused(method: str) -> None:
 
 
 def test_overfits_the_ball(tmp_path: Path) -> None:
-    """With eight views: 25 dB in a training view, its colours 5 dB better than a single colour."""
+    """With eight views, a training view has 25 dB, and its colours are 5 dB better than a single colour."""
     avatar = trained(tmp_path, load_settings("nerf", SMALL).training, RING)
     assert psnr(avatar, tmp_path, "0") > 25
     colours, one_colour = inner_psnr(avatar, tmp_path, "0")
     assert colours > one_colour + 5
 
 
-def test_all_that_the_box_can_show_is_trained_on_and_drawn(fog: NerfField, tmp_path: Path) -> None:
-    """A camera 2 m before the middle of a box of 2 m sees its near side, 1 m away, in the whole image; one 12 m away
-    sees the box in the middle of the image and not in the corner."""
+def test_visible_pixels_are_all_that_see_the_box(fog: NerfField, tmp_path: Path) -> None:
+    """A camera 2 m from the centre of a box of 2 m sees its near side, 1 m away, in the whole image. A camera 12 m away
+    sees the box in the middle of the image but not in the corner."""
     camera = record(tmp_path)[0].cameras["0"]
     vertices_m = body().vertices_m()[0].numpy()
     assert fog.visible_pixels(camera, vertices_m).all()
@@ -138,8 +140,8 @@ def test_all_that_the_box_can_show_is_trained_on_and_drawn(fog: NerfField, tmp_p
     assert visible_pixels[len(visible_pixels) // 2, visible_pixels.shape[1] // 2] and not visible_pixels[0, 0]
 
 
-def test_two_opposite_views_say_nothing_of_the_view_between(tmp_path: Path) -> None:
-    """The networks learn the two images, not the ball: a view from the side loses at least 6 dB."""
+def test_two_opposite_views_do_not_determine_the_view_between(tmp_path: Path) -> None:
+    """The networks learn the two images, not the ball, so a view from the side is at least 6 dB worse."""
     avatar = trained(tmp_path, load_settings("nerf", SMALL + FEWER).training, ("0", "4"))
     assert psnr(avatar, tmp_path, "0") > 20
     assert psnr(avatar, tmp_path, "2") < psnr(avatar, tmp_path, "0") - 6

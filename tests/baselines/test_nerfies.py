@@ -31,9 +31,9 @@ SMALL = [
 ]
 
 
-def test_a_quarter_turn_by_hand() -> None:
-    """A turn about z while moving along x: x goes to y, and the origin along a circle of radius 2 / pi about (0, 2 /
-    pi) to (2 / pi, 2 / pi). Without a turn only the translation is left."""
+def test_screw_motion_of_a_quarter_turn_by_hand() -> None:
+    """A quarter turn about z while moving along x takes x to y. It takes the origin along a circle of radius 2 / pi
+    about (0, 2 / pi) to (2 / pi, 2 / pi). Without rotation only the translation remains."""
     quarter = math.pi / 2
     rotation, translation = screw_motion(torch.tensor([0.0, 0.0, quarter]), torch.tensor([1.0, 0.0, 0.5]))
     torch.testing.assert_close(rotation, torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), atol=1e-6, rtol=0)
@@ -54,9 +54,9 @@ def test_screw_motions_are_matrix_exponentials(size: float) -> None:
     torch.testing.assert_close(translation, wanted[:3, 3], atol=1e-9, rtol=0)
 
 
-def test_octaves_come_one_after_another() -> None:
-    """With 1.5 of 3: the first counts, the second by (1 - cos(pi / 2)) / 2 = 0.5, the third not; with 1.25 the second
-    by (1 - cos(pi / 4)) / 2; the position itself always."""
+def test_annealing_enables_octaves_one_after_another() -> None:
+    """With 1.5 of 3 octaves, the first has full weight, the second (1 - cos(pi / 2)) / 2 = 0.5 and the third none. With
+    1.25 octaves, the second has (1 - cos(pi / 4)) / 2. The position itself always has full weight."""
     encoded = positional_encoding(torch.tensor([[0.1, 0.2, 0.3]]), 3)
     for octaves, second in ((1.5, 0.5), (1.25, (1 - math.sqrt(0.5)) / 2)):
         share = annealed(encoded, torch.tensor(octaves)) / encoded
@@ -66,21 +66,22 @@ def test_octaves_come_one_after_another() -> None:
 
 
 def test_elastic_energy_by_hand() -> None:
-    """A rotation costs nothing. A stretch by e has (x / c)^2 = 1 / 0.03^2 = 1111.1: 2 x 1111.1 / 1115.1; by e^0.03 it
-    is 1: 2 / 5; by that in all directions, or its inverse, 3: 6 / 7."""
+    """A rotation costs nothing. For a stretch by e, (x / c)^2 = 1 / 0.03^2 = 1111.1, which costs 2 x 1111.1 / 1115.1.
+    For a stretch by e^0.03 it is 1, which costs 2 / 5. For that stretch in all directions, or its inverse, it is 3,
+    which costs 6 / 7."""
     rotation = screw_motion(torch.tensor([0.3, -0.5, 0.8]), torch.zeros(3))[0]
     stretches = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 0.03, 0], [0.03, 0.03, 0.03], [-0.03, -0.03, -0.03]]).exp()
     energy = elastic_energy(rotation @ torch.diag_embed(stretches))
     torch.testing.assert_close(energy, torch.tensor([0.0, 1.992827, 0.4, 6 / 7, 6 / 7]), atol=1e-5, rtol=1e-4)
 
 
-def test_gradient_of_the_elastic_energy_in_double() -> None:
+def test_elastic_energy_gradient_matches_finite_differences() -> None:
     change = torch.eye(3).double() + 0.02 * torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(0)).double()
     assert torch.autograd.gradcheck(elastic_energy, change.requires_grad_())
 
 
-def test_jacobian_of_the_deformation_in_double() -> None:
-    """Against central differences, with a deformation that does something."""
+def test_deformation_jacobian_matches_finite_differences() -> None:
+    """Compare with central differences in double precision, for a deformation with random weights."""
     torch.manual_seed(0)
     deformation = Deformation(4, 16).double()
     torch.nn.init.normal_(deformation.screw.weight)
@@ -97,8 +98,8 @@ def test_jacobian_of_the_deformation_in_double() -> None:
 
 
 def test_samples_are_chosen_by_weight() -> None:
-    """With weights 1, 0, 3 the first quarter of draws takes the first, the rest the last; without any weight, the
-    last."""
+    """With weights 1, 0, 3 the first quarter of draws picks the first sample, the rest the last. If all weights are
+    zero, the last sample is picked."""
     weights = torch.tensor([[1.0, 0.0, 3.0]]).repeat(4, 1)
     assert sample_index(weights, torch.tensor([0.0, 0.24, 0.26, 0.999])).tolist() == [0, 0, 2, 2]
     assert sample_index(torch.zeros(1, 3), torch.tensor([0.5])).tolist() == [2]
@@ -111,7 +112,7 @@ def field() -> NerfiesField:
 
 
 def evaluate(field: NerfiesField, training: bool) -> RaySamples:
-    """Evaluate one ray from above through the upright column."""
+    """Evaluate one ray that passes from above through the upright column."""
     fit = three_poses()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.arange(3), 2.5)
@@ -121,8 +122,9 @@ def evaluate(field: NerfiesField, training: bool) -> RaySamples:
     return field.sample(field.scene(bodies, conditions), ray, draws)[0]
 
 
-def test_training_anneals_and_looking_does_not(field: NerfiesField) -> None:
-    """A step may evaluate the field twice, with half of its rays each."""
+def test_elastic_loss_is_computed_only_in_training_and_progress_is_set_explicitly(field: NerfiesField) -> None:
+    """Evaluating the field does not advance the annealing, because a step may evaluate it twice, with half of its rays
+    each."""
     assert evaluate(field, training=False).elastic is None
     assert evaluate(field, training=True).elastic is not None
     assert field.progress == 0
@@ -130,7 +132,7 @@ def test_training_anneals_and_looking_does_not(field: NerfiesField) -> None:
     assert field.state_dict()["progress"] == pytest.approx(0.2)
 
 
-def test_what_stands_still_or_turns_as_a_whole_costs_nothing_and_what_swells_does(field: NerfiesField) -> None:
+def test_rigid_motions_have_no_elastic_loss_and_stretching_has(field: NerfiesField) -> None:
     """A constant screw is a rigid motion; one that grows with the position is not."""
     with torch.no_grad():
         field.deformation.screw.bias.copy_(torch.tensor([0.4, -0.2, 0.7, 0.1, 0.0, -0.3]))
@@ -142,8 +144,8 @@ def test_what_stands_still_or_turns_as_a_whole_costs_nothing_and_what_swells_doe
     assert rigid.item() < 1e-6 and swollen.item() > 1e-2
 
 
-def test_the_deformation_begins_smooth_and_ends_with_all_octaves(field: NerfiesField) -> None:
-    """A screw that reads only the highest octave is zero at first and complete after its share of training."""
+def test_the_deformation_uses_all_octaves_only_after_annealing(field: NerfiesField) -> None:
+    """After the annealing share of training, a random screw sees the complete encoding; before that, it does not."""
     assert field.settings.anneal_share == 0.3333
     torch.nn.init.normal_(field.deformation.screw.weight)
     points = torch.rand(20, 3)
@@ -163,13 +165,14 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
 
 
 def test_overfits_two_frames(learned: Learned) -> None:
-    """27 dB in both, with progress noted up to the last step."""
+    """Both frames have 27 dB, and progress is recorded up to the last step."""
     assert learned.avatar.field.progress == pytest.approx(59 / 60)
     assert min(learned.psnr(frame) for frame in (0, 1)) > 27
 
 
-def test_a_pose_that_no_frame_has_shows_the_template(learned: Learned) -> None:
-    """It is upright as trained, although the pose is bent: 4 dB worse; the surface is the same for two such poses."""
+def test_a_novel_pose_renders_the_template(learned: Learned) -> None:
+    """The novel pose is bent, but its rendering is upright as in training, which is 4 dB worse. The surface is the same
+    for two novel poses."""
     assert learned.psnr(2) < min(learned.psnr(frame) for frame in (0, 1)) - 4
     one, other = torch.zeros(2, 2, 3)
     one[1, 1], other[1, 1] = 0.3, 0.35

@@ -14,7 +14,7 @@ from tests.baselines.column import learn, three_poses
 SMALL = [
     "training.steps=95",
     "training.rays_per_frame=96",
-    "training.field.voxel_m=0.0613",  # no fraction of the column's edges, so that no vertex lies between voxels
+    "training.field.voxel_m=0.0613",  # not commensurate with the column's edges, so no vertex lies between voxels
     "training.field.samples=16",
     "training.field.channels=8",
     "training.field.width=32",
@@ -30,7 +30,7 @@ def field() -> NeuralBodyField:
 
 
 def posed(field: NeuralBodyField, root: torch.Tensor | None = None) -> tuple[PosedBodies, Conditions]:
-    """Return the three poses, or the first of them elsewhere, which belongs to no frame."""
+    """Return the three poses, or the first one moved to `root`, which belongs to no frame."""
     fit = three_poses()
     rows = slice(None) if root is None else slice(1)
     theta, root = fit.theta[rows], fit.root if root is None else root[None]
@@ -40,14 +40,14 @@ def posed(field: NeuralBodyField, root: torch.Tensor | None = None) -> tuple[Pos
 
 
 def look(field: NeuralBodyField, region: NeuralBodyRegion, rows: list[int]) -> torch.Tensor:
-    """Return the colour of two rays' samples in these rows."""
+    """Return the colours of two rays' samples in the given rows of poses."""
     bodies, conditions = posed(field)
     draws = Draws.deterministic(2, field.samples, torch.device("cpu"))
     rays = Rays(*DOWN, torch.tensor(rows))
     return field.sample(PosedScene(bodies, region, conditions), rays, draws)[0].colour
 
 
-def test_codes_are_diffused_once_a_frame_in_training_and_once_a_rendering(field: NeuralBodyField) -> None:
+def test_codes_are_diffused_once_per_frame_in_training_and_once_per_rendering(field: NeuralBodyField) -> None:
     calls: list[int] = []
     field.diffusion.register_forward_hook(lambda *_: calls.append(1))
     region = field.region(*posed(field))
@@ -63,14 +63,14 @@ def test_codes_are_diffused_once_a_frame_in_training_and_once_a_rendering(field:
     assert len(calls) == 4
 
 
-def test_sees_the_same_in_training_as_in_evaluation(field: NeuralBodyField) -> None:
+def test_colours_are_the_same_in_training_and_evaluation_mode(field: NeuralBodyField) -> None:
     learning = look(field, field.region(*posed(field)), [0, 2])
     field.eval()
     torch.testing.assert_close(learning, look(field, field.region(*posed(field)), [0, 2]))
 
 
-def test_density_moves_with_the_root(field: NeuralBodyField) -> None:
-    """After a quarter turn about z and a translation, the pseudo-distance at the moved points is the same."""
+def test_density_moves_rigidly_with_the_root_transform(field: NeuralBodyField) -> None:
+    """After a quarter turn about z and a translation, the pseudo-distance at the moved points is unchanged."""
     field.eval()
     root = torch.eye(4)
     root[:2, :2], root[:3, 3] = torch.tensor([[0.0, -1.0], [1.0, 0.0]]), torch.tensor([3.0, -2.0, 0.5])
@@ -83,8 +83,8 @@ def test_density_moves_with_the_root(field: NeuralBodyField) -> None:
     torch.testing.assert_close(there, here, atol=1e-6, rtol=0)
 
 
-def test_appearance_is_the_frames_own_and_zero_for_novel_poses(field: NeuralBodyField) -> None:
-    """Frame 0 was trained, frame 1 was not: a novel pose looks like frame 1."""
+def test_appearance_codes_are_per_frame_and_zero_for_novel_poses(field: NeuralBodyField) -> None:
+    """Frame 0 has a trained code and frame 1 has not, so a novel pose looks like frame 1."""
     with torch.no_grad():
         field.codes[0] = 3.0
     bodies, conditions = posed(field)
@@ -98,9 +98,9 @@ def test_appearance_is_the_frames_own_and_zero_for_novel_poses(field: NeuralBody
     assert (colour(0) - colour(1)).abs().max() > 0.01
 
 
-def test_overfits_two_frames_and_loses_the_pose_it_has_not_seen(tmp_path: Path) -> None:
-    """29 dB in both training frames. Bent by 80 degrees, an untrained pose, it loses 3 dB: the convolutions see
-    untrained stencils, and there is no prior of the body."""
+def test_overfits_two_frames_and_does_not_generalise_to_a_novel_pose(tmp_path: Path) -> None:
+    """Both training frames have 29 dB. Bent by 80 degrees, the novel pose is 3 dB worse: the convolutions see untrained
+    stencils, and there is no prior of the body."""
     learned = learn(tmp_path, load_settings("neural-body", SMALL).training, (0.0, 0.2, 1.4))
     trained = [learned.psnr(frame) for frame in (0, 1)]
     assert min(trained) > 29

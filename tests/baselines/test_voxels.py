@@ -7,9 +7,9 @@ SIZE = 7
 
 
 def scattered() -> tuple[torch.Tensor, torch.Tensor]:
-    """Return a grid of 7 x 7 x 7 with a tenth of it active: coordinates (N, 3), grid (7, 7, 7) bool."""
+    """Return a grid of 7 x 7 x 7 voxels, a tenth of them active: coordinates (N, 3), grid (7, 7, 7) bool."""
     active = torch.rand(SIZE, SIZE, SIZE, generator=torch.Generator().manual_seed(0)) < 0.1
-    active[0, 0, 0] = active[-1, -1, -1] = True  # so that coordinates start at 0 and end at 6
+    active[0, 0, 0] = active[-1, -1, -1] = True  # so that coordinates span 0 to 6
     return torch.nonzero(active), active
 
 
@@ -20,13 +20,13 @@ def dense(coordinates: torch.Tensor, values: torch.Tensor, size: int) -> torch.T
 
 
 def coordinates_of(level: Level) -> torch.Tensor:
-    """Return the coordinates (N, 3) by row."""
+    """Return the voxel coordinates (N, 3) of each row."""
     at = torch.nonzero(level.rows < level.rows.max())
     return (at - 2)[level.rows[tuple(at.T)].argsort()]
 
 
 def convolution(inputs: int, outputs: int) -> tuple[SparseConvolution, torch.Tensor]:
-    """Return a sparse convolution without normalisation, and its kernel in the layout of torch's own."""
+    """Return a sparse convolution without normalisation, and its kernel in torch's layout."""
     torch.manual_seed(0)
     sparse = SparseConvolution(inputs, outputs)
     sparse.norm = torch.nn.Identity()
@@ -37,7 +37,7 @@ def padded(values: torch.Tensor) -> torch.Tensor:
     return torch.cat([values, torch.zeros_like(values[:1])])
 
 
-def test_agrees_with_dense_convolution_where_voxels_are_active() -> None:
+def test_sparse_convolution_matches_dense_at_active_voxels() -> None:
     coordinates, _ = scattered()
     values = torch.randn(len(coordinates), 3)
     sparse, kernel = convolution(3, 2)
@@ -48,8 +48,8 @@ def test_agrees_with_dense_convolution_where_voxels_are_active() -> None:
     assert not found[-1].any()
 
 
-def test_stride_two_agrees_with_dense_convolution() -> None:
-    """The active voxels agree, too: those whose stencil contains an active one."""
+def test_strided_sparse_convolution_matches_dense() -> None:
+    """The coarse active voxels match too: those whose stencil contains an active voxel."""
     coordinates, active = scattered()
     values = torch.randn(len(coordinates), 3)
     finest = Voxels.around(coordinates.float(), 1.0, 2)
@@ -64,8 +64,9 @@ def test_stride_two_agrees_with_dense_convolution() -> None:
     torch.testing.assert_close(found, wanted[0][:, *there.T].T, atol=1e-6, rtol=1e-5)
 
 
-def test_reads_as_a_dense_grid_does() -> None:
-    """Interpolation is trilinear between active and empty voxels, zero outside the grid and far from it."""
+def test_interpolation_matches_a_dense_grid() -> None:
+    """Interpolation is trilinear between active and empty voxels, and zero outside the grid and far from active
+    voxels."""
     coordinates, _ = scattered()
     values = torch.randn(len(coordinates), 4)
     at = torch.rand(500, 3) * (SIZE + 6) - 3
@@ -77,8 +78,8 @@ def test_reads_as_a_dense_grid_does() -> None:
     torch.testing.assert_close(found, wanted[0, :, 0, 0].T, atol=1e-5, rtol=1e-5)
 
 
-def test_every_point_has_the_voxel_nearest_to_it() -> None:
-    """Edges of 0.1 m from the lower corner (1, 2, 3): offsets of 0.04 and 0.06 m fall to voxels 0 and 1."""
+def test_every_vertex_is_assigned_its_nearest_voxel() -> None:
+    """With edges of 0.1 m from the lower corner (1, 2, 3), offsets of 0.04 and 0.06 m fall into voxels 0 and 1."""
     points = torch.tensor([[1.0, 2.0, 3.0], [1.04, 2.0, 3.0], [1.06, 2.0, 3.0], [1.0, 2.0, 3.3]])
     voxels = Voxels.around(points, 0.1, 1)
     places = coordinates_of(voxels.levels[0])[voxels.vertex]
