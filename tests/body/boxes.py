@@ -1,4 +1,4 @@
-"""A body small enough to work out by hand: a unit box, and a two-joint column of stacked boxes."""
+"""Bodies small enough to work out by hand: a unit box, and a two-joint column of stacked boxes."""
 
 import dataclasses
 
@@ -10,14 +10,14 @@ from hnerf.body.rig import Rig
 
 
 def box_vertices(height_m: float = 1.0, levels: int = 1) -> Tensor:
-    """Return corners of the unit square at levels + 1 heights, (4 (levels + 1), 3)."""
+    """Return the corners of the unit square at levels + 1 heights, (4 (levels + 1), 3)."""
     square = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     heights = torch.linspace(0, height_m, levels + 1)
     return torch.cat([torch.cat([square, z.expand(4, 1)], 1) for z in heights])
 
 
 def box_faces(levels: int = 1) -> Tensor:
-    """Return outward triangles of the closed column."""
+    """Return the outward-facing triangles of the closed column."""
     faces = [[0, 2, 1], [0, 3, 2]]
     for level in range(levels):
         for k in range(4):
@@ -28,8 +28,8 @@ def box_faces(levels: int = 1) -> Tensor:
 
 
 def box_rig(bend_segments: int = 0, splits: int = 0) -> Rig:
-    """Return the unit box on one bone, or with `bend_segments` a column of 2 m that bends at 1 m, smoothly from 0.67 to
-    1.33 m. Each of `splits` halves every edge."""
+    """Return the unit box on one bone, or with `bend_segments` a column of 2 m that bends smoothly from 0.67 to 1.33 m
+    about its joint at 1 m. Each of `splits` halves every edge."""
     levels, height_m = max(bend_segments, 1), 2.0 if bend_segments else 1.0
     vertices, faces = box_vertices(height_m, levels), box_faces(levels)
     for _ in range(splits):
@@ -43,7 +43,8 @@ def box_rig(bend_segments: int = 0, splits: int = 0) -> Rig:
 
 
 def hinged(vertices_m: Tensor, faces: Tensor, joints_m: Tensor, names: tuple[str, ...], upper: Tensor) -> Rig:
-    """Return a rig of two bones, of which the upper one has these weights (V,); its one shape moves nothing."""
+    """Return a rig of two bones with skinning weights `upper` (V,) of the upper bone; its single shape moves
+    nothing."""
     return Rig(
         vertices_m=vertices_m,
         faces=faces,

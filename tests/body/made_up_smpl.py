@@ -1,4 +1,5 @@
-"""A person of tubes in the file format of SMPL and SMPL-X: the same keys, sizes and vertex numbers; no shape data."""
+"""A made-up person of tubes in the file format of SMPL and SMPL-X: same keys, sizes and vertex numbers, but no SMPL
+data."""
 
 import pickle
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-# T pose as SMPL has it, Y up, facing +Z, origin at the breast: joints 0 to 21, metres.
+# Joints 0 to 21 of a T pose in SMPL's axes: Y up, facing +Z, origin at the chest; metres.
 JOINTS_M = np.array([
     [0, -0.22, 0.03], [0.06, -0.31, 0.02], [-0.06, -0.31, 0.02], [0, -0.11, 0.0], [0.10, -0.70, 0.03],
     [-0.10, -0.70, 0.03], [0, 0.03, 0.0], [0.09, -1.10, 0.0], [-0.09, -1.10, 0.0], [0, 0.08, 0.03],
@@ -21,7 +22,7 @@ ENDS = {0: 3, 3: 6, 6: 9, 9: 12, 12: 15, 1: 4, 2: 5, 4: 7, 5: 8, 7: 10, 8: 11, 1
 RADII_M = {0: 0.12, 3: 0.12, 6: 0.12, 9: 0.12, 12: 0.06, 15: 0.09, 1: 0.08, 2: 0.08, 4: 0.05, 5: 0.05}
 LEFT_ELBOW = 18
 
-# By the smplx package's vertex_ids, SMPL's then SMPL-X's: vertex, the joint that carries it, and its place from there.
+# Vertex numbers in SMPL and in SMPL-X (vertex_ids of the smplx package), joint of the vertex, offset from that joint.
 LANDMARKS = (
     (332, 9120, 15, (0, 0.03, 0.13)), (6260, 9929, 15, (-0.03, 0.07, 0.1)), (2800, 9448, 15, (0.03, 0.07, 0.1)),
     (4071, 616, 15, (-0.08, 0.05, 0.02)), (583, 6, 15, (0.08, 0.05, 0.02)),
@@ -31,8 +32,9 @@ LANDMARKS = (
 
 
 def made_up_smpl(kind: str = "smpl", seed: int = 0) -> dict[str, Any]:
-    """Return the arrays of a model file. Shapes: all larger, longer legs, longer arms, wider hips, then small changes
-    of the limbs. Pose blend shapes: the left elbow's turn lifts vertices on the left forearm."""
+    """Return the arrays of a model file. Shapes 0 to 3 make everything larger, the legs longer, the arms longer and the
+    hips wider; the others change limbs a little. The only pose blend shape lifts the vertices of the left forearm when
+    the left elbow turns."""
     joints_m, parents = _skeleton(kind)
     count = {"smpl": 6890, "smplx": 10475}[kind]
     tube = count // len(joints_m)
@@ -74,7 +76,7 @@ def made_up_smpl(kind: str = "smpl", seed: int = 0) -> dict[str, Any]:
 
 
 def write_smpl(path: Path, kind: str = "smpl") -> Path:
-    """Write the model as .npz, or as .pkl with a sparse regressor as SMPL's own files have it."""
+    """Write the model as .npz, or as .pkl with a sparse regressor like SMPL's own files."""
     data = made_up_smpl(kind)
     if path.suffix == ".npz":
         np.savez(path, **data, part2num=np.array({"head": 15}, object))
@@ -85,7 +87,7 @@ def write_smpl(path: Path, kind: str = "smpl") -> Path:
 
 
 def _skeleton(kind: str) -> tuple[np.ndarray, list[int]]:
-    """Return the skeleton: with hands for SMPL; with jaw, eyes and fingers of zero length for SMPL-X."""
+    """Return joint positions and parents: with hands for SMPL; with jaw, eyes and short fingers for SMPL-X."""
     if kind == "smpl":
         more = [(20, (0.08, 0, 0)), (21, (-0.08, 0, 0))]
     else:
@@ -96,7 +98,7 @@ def _skeleton(kind: str) -> tuple[np.ndarray, list[int]]:
 
 
 def _joint_shapes(joints_m: np.ndarray, parents: list[int], random: np.random.Generator) -> np.ndarray:
-    """Return how each joint moves with each of ten shapes, (J, 3, 10): each bone lengthens by a share."""
+    """Return the displacement of each joint by each of ten shapes, (J, 3, 10): each bone lengthens by a fraction."""
     shares = random.normal(0, 0.01, (len(joints_m), 10))
     shares[:, 0] = 0.05
     shares[:, 1] = np.isin(range(len(joints_m)), (4, 5, 7, 8)) * 0.08
@@ -106,13 +108,13 @@ def _joint_shapes(joints_m: np.ndarray, parents: list[int], random: np.random.Ge
     moves = np.zeros((len(joints_m), 3, 10))
     moves[0] = joints_m[0][:, None] * shares[0]
     for j, parent in enumerate(parents[1:], 1):
-        twin = {5: 4, 8: 7, 19: 18, 21: 20, 17: 16, 14: 13, 11: 10}.get(j, j)  # both sides alike
+        twin = {5: 4, 8: 7, 19: 18, 21: 20, 17: 16, 14: 13, 11: 10}.get(j, j)  # both sides have the same fraction
         moves[j] = moves[parent] + (joints_m[j] - joints_m[parent])[:, None] * shares[twin]
     return moves
 
 
 def _tip(joint: int, start: np.ndarray) -> np.ndarray:
-    """Return the vector from a last joint to its end."""
+    """Return the vector from a joint without children to its end."""
     if joint == 15:
         return np.array([0, 0.2, 0])
     if joint in (10, 11):
@@ -123,8 +125,8 @@ def _tip(joint: int, start: np.ndarray) -> np.ndarray:
 
 
 def _tube(start: np.ndarray, end: np.ndarray, radius_m: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a tube of seven rings, with the remaining vertices at its end: share of the way (N,) and positions (N,
-    3)."""
+    """Return a tube of seven rings: the fraction along its length (N,) and positions (N, 3). Vertices that do not fill
+    a ring lie at its end."""
     around = count // 7
     along = np.minimum(np.arange(count) // around, 6) / 6
     axis = (end - start) / np.linalg.norm(end - start)
@@ -136,7 +138,7 @@ def _tube(start: np.ndarray, end: np.ndarray, radius_m: float, count: int) -> tu
 
 
 def _tube_faces(ids: np.ndarray, around: int) -> np.ndarray:
-    """Return the outward triangles between rings."""
+    """Return the outward-facing triangles between rings."""
     a = ids[: 6 * around].reshape(6, around)
     b, c, d = np.roll(a, -1, 1), a + around, np.roll(a, -1, 1) + around
     return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])

@@ -1,4 +1,4 @@
-"""A naked body of known shape and pose, recorded without error: keypoints and masks in a ring of cameras."""
+"""A naked body of known shape and pose, recorded without error: keypoints and masks from a ring of cameras."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from hnerf.geometry.silhouette import silhouette
 
 
 def silhouettes(capture: Capture, body: BodyFit) -> Masks:
-    """Return masks of the training cameras; requesting another camera's fails."""
+    """Return masks of the training cameras; requesting another camera's mask fails."""
     encoded, faces = {}, body.rig.faces.numpy()
     for frame, vertices_m in zip(body.frames, body.vertices_m().numpy(), strict=True):
         for name in capture.train_cameras:
@@ -25,7 +25,7 @@ def silhouettes(capture: Capture, body: BodyFit) -> Masks:
 
 
 def ring_camera(name: str, angle: float, size_px: int = 256) -> Camera:
-    """Return a camera 3 m from the origin and 1 m high that looks level at the axis."""
+    """Return a camera 3 m from the z axis at a height of 1 m, looking horizontally at the axis."""
     forward = -np.array([np.cos(angle), np.sin(angle), 0])
     R = np.stack([np.cross(forward, [0, 0, 1]), [0, 0, -1], forward])
     K = np.array([[size_px * 1.1, 0, size_px / 2], [0, size_px * 1.1, size_px / 2], [0, 0, 1]])
@@ -36,7 +36,7 @@ RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
 
 
 def moving_body(frames: tuple[int, ...]) -> BodyFit:
-    """Return a tall, slim person with long shins who swings arms and legs, feet near z = 0."""
+    """Return a tall, slim person with long shins who swings arms and legs, with feet near z = 0."""
     beta = torch.tensor(ADULT)
     for name, value in (("height", 0.55), ("weight", 0.4), ("measure-lowerleg-height", 0.3), ("hip-scale-horiz", -0.3)):
         beta[BETA_NAMES.index(name)] = value
@@ -56,13 +56,13 @@ def moving_body(frames: tuple[int, ...]) -> BodyFit:
 
 
 def true_pose(body: BodyFit) -> Pose:
-    """Return the poses of a body in double precision, as a fit has them."""
+    """Return the poses of a body in double precision, as used by the fit."""
     rig, nothing = body.rig.to(dtype=torch.float64), torch.zeros(25, 3, dtype=torch.float64)
     return Pose(rig, body.theta.double(), body.root.double(), nothing)
 
 
 def record(root: Path, body: BodyFit, cameras: dict[str, Camera], train: tuple[str, ...]) -> Capture:
-    """Record exact keypoints of all cameras; test cameras get nonsense, which nothing may read."""
+    """Record exact keypoints in the training cameras. Test cameras get nonsense, because nothing may read them."""
     keypoints_m = (body.rig.keypoint_weights @ body.vertices_m()).double().numpy()
     stored = {}
     for name, camera in cameras.items():

@@ -1,4 +1,4 @@
-"""Closest points of a body by trying every triangle, with signs by the winding number."""
+"""Reference for closest points of a body: try every triangle, and take signs from the winding number."""
 
 import torch
 import trimesh
@@ -10,8 +10,8 @@ from hnerf.body.descriptor import ClosestPoints
 
 
 def closest_points_reference(points_m: Tensor, vertices_m: Tensor, faces: Tensor, reach_m: float) -> ClosestPoints:
-    """Return the closest points of one mesh (V, 3), with signs by summed solid angles (van Oosterom and Strackee 1983).
-    Memory grows with points x faces."""
+    """Return the closest points on one mesh (V, 3), with signs from summed solid angles (van Oosterom and Strackee
+    1983). Memory grows with points x faces."""
     mesh = trimesh.Trimesh(vertices_m, faces, process=False)
     closest_m, distance_m, face = closest_point_naive(mesh, points_m.numpy())
     barycentric = torch.from_numpy(points_to_barycentric(mesh.triangles[face], closest_m))
@@ -23,7 +23,7 @@ def closest_points_reference(points_m: Tensor, vertices_m: Tensor, faces: Tensor
 
 
 def on_surface(vertices_m: Tensor, faces: Tensor, found: ClosestPoints) -> Tensor:
-    """Return where closest points are, (N, 3)."""
+    """Return the positions (N, 3) of closest points."""
     return (vertices_m[faces[found.face]] * found.barycentric[..., None]).sum(1)
 
 

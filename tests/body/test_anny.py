@@ -5,7 +5,7 @@ from hnerf.body.anny import ADULT, BETA_NAMES, _coefficients, anny_rig
 from hnerf.body.rig import pose_vertices
 
 
-def test_the_average_adult_is_a_watertight_person() -> None:
+def test_the_average_adult_is_watertight_and_of_plausible_height() -> None:
     rig = anny_rig()
     edges = torch.cat([rig.faces[:, [0, 1]], rig.faces[:, [1, 2]], rig.faces[:, [2, 0]]])
     _, counts = edges.sort(1).values.unique(dim=0, return_counts=True)
@@ -39,8 +39,9 @@ def test_the_shape_basis_is_the_derivative_of_the_rig() -> None:
 
 
 @pytest.mark.parametrize("phenotypes", [0.0, 0.37, 0.5, 1.0])
-def test_derivatives_of_coefficients_are_those_of_autograd(phenotypes: float) -> None:
-    """At 0 and 1, the ends of the range, and at 0.5, an anchor of most phenotypes, too. Ages below 0 are not ours."""
+def test_derivatives_of_coefficients_match_autograd(phenotypes: float) -> None:
+    """This includes 0 and 1, the ends of the range, and 0.5, an anchor of most phenotypes. Ages below 0 are not
+    supported."""
     beta = torch.tensor([phenotypes] * 6 + [0.1] * 22, dtype=torch.float64)
     beta[1] = max(phenotypes, 0.1)
     found = _coefficients(beta)[1:]  # first, since the model cannot be loaded inside a transform
@@ -57,7 +58,7 @@ def test_local_changes_are_linear_with_no_kink_at_zero() -> None:
     assert float((up - at).abs().max()) > 0.02
 
 
-def test_shape_values_are_held_to_their_range() -> None:
+def test_shape_values_are_clamped_to_their_range() -> None:
     assert torch.equal(anny_rig(torch.full((28,), 2.0)).beta, torch.ones(28))
     assert anny_rig(torch.full((28,), -2.0)).beta.tolist() == [0.0] * 6 + [-1.0] * 22
 

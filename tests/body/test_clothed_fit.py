@@ -1,4 +1,4 @@
-"""Cloth offsets worked out by hand: on one triangle, on a ball's outline, and on a body that they pull aside."""
+"""Cloth offsets worked out by hand: on one triangle, on a ball's outline, and on a body that they pull sideways."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,33 +23,35 @@ from tests.body.recorded_body import RING, moving_body, record, ring_camera, tru
 from tests.body.test_contour_fit import SCALE_M, SEEN_PX, ball, disc
 
 
-def test_neighbours_wear_nearly_the_same() -> None:
-    """One corner of a triangle is 1 cm too small: (1 + 0.02 + 2 x 2) a - 2 b - 2 b = 0.01 there, and at the two others
-    (0.02 + 2 x 2) b - 2 a - 2 b = 0, so b = a / 1.01 and a = 0.01 / (5.02 - 4 / 1.01)."""
+def test_cloth_offsets_are_smooth_between_neighbours() -> None:
+    """One corner of a triangle is 1 cm too small. There, (1 + 0.02 + 2 x 2) a - 2 b - 2 b = 0.01; at the two others,
+    (0.02 + 2 x 2) b - 2 a - 2 b = 0. So b = a / 1.01 and a = 0.01 / (5.02 - 4 / 1.01)."""
     rows = ContourResiduals(np.array([0]), np.zeros((1, 3)), np.array([-0.01]), np.ones(1))
     a = 0.01 / (5.02 - 4 / 1.01)
     np.testing.assert_allclose(solve_cloth_offset(np.zeros(3), [rows], np.array([[0, 1, 2]])), [a, a / 1.01, a / 1.01])
 
 
-def test_an_edge_of_two_faces_ties_its_ends_once() -> None:
-    """Two triangles on either side of the edge 1-2; vertex 1 is 1 cm too small. At 1, (1.02 + 6) a - 4 c - 2 b = 0.01;
-    at 2, 6.02 b - 2 a - 4 c = 0; at 0 and 3, 4.02 c - 2 a - 2 b = 0."""
+def test_an_edge_shared_by_two_faces_counts_once() -> None:
+    """Two triangles share the edge 1-2; vertex 1 is 1 cm too small. At 1, (1.02 + 6) a - 4 c - 2 b = 0.01; at 2, 6.02 b
+    - 2 a - 4 c = 0; at 0 and 3, 4.02 c - 2 a - 2 b = 0."""
     rows = ContourResiduals(np.array([1]), np.zeros((1, 3)), np.array([-0.01]), np.ones(1))
     found = solve_cloth_offset(np.zeros(4), [rows], np.array([[0, 1, 2], [2, 1, 3]]))
     a, b, c = np.linalg.solve([[7.02, -2, -4], [-2, 6.02, -4], [-2, -2, 4.02]], [0.01, 0, 0])
     np.testing.assert_allclose(found, [c, a, b, c])
 
 
-def test_more_cloth_fills_what_was_too_small() -> None:
-    """A body 1 cm too small in 3 cm more cloth is 2 cm too large: 1 / (1 + 1)^2; at another vertex nothing changes."""
+def test_adding_cloth_shifts_residuals_and_reweights_them() -> None:
+    """Where the body is 1 cm too small, 3 cm more cloth makes it 2 cm too large, with a weight of 1 / (1 + 1)^2. At the
+    other vertex nothing changes."""
     rows = ContourResiduals(np.array([2, 0]), np.zeros((2, 3)), np.array([-0.01, 0.0]), np.full(2, 9.0))
     found = _with_more_cloth(rows, np.array([0, 0.5, 0.03]))
     np.testing.assert_allclose(found.residual_m, [0.02, 0])
     np.testing.assert_allclose(found.weight, [0.25, 1])
 
 
-def test_what_is_seen_often_is_worn_as_seen() -> None:
-    """A thousand matches 1 cm outside an offset of 2 cm, in two images, give 3 cm; inside, 1 cm."""
+def test_many_matches_outweigh_the_smoothness_prior() -> None:
+    """With an offset of 2 cm, a thousand matches 1 cm outside of it, in two images, give 3 cm; inside, they give 1
+    cm."""
     for residual_m, worn_m in ((-0.01, 0.03), (0.01, 0.01)):
         rows = ContourResiduals(
             np.repeat([0, 1, 2], 500), np.zeros((1500, 3)), np.full(1500, residual_m), np.ones(1500)
@@ -59,15 +61,16 @@ def test_what_is_seen_often_is_worn_as_seen() -> None:
 
 
 def matched(edge: Outline) -> tuple[ContourResiduals, np.ndarray]:
-    """Return how a ball of 0.2 m before a camera matches an outline, and the outward directions of matched vertices."""
+    """Return the match of a ball of 0.2 m in front of a camera with an outline, and the outward directions of the
+    matched vertices."""
     vertices, faces = ball(0.2, 1.0)
     rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
     return rows, (vertices[rows.vertices] - (0, 0, 1)) / 0.2
 
 
 @pytest.mark.parametrize("grow_px", [2, -2])
-def test_outlines_pull_both_ways_alike(grow_px: int) -> None:
-    """A ball 2 px too small or too large has residuals of 2 px, with a weight of 1 / (1 + (off / 2 cm)^2)^2."""
+def test_outlines_pull_inwards_and_outwards_alike(grow_px: int) -> None:
+    """A ball 2 px too small or too large has residuals of 2 px, with weights 1 / (1 + (residual / 2 cm)^2)^2."""
     edge = outline(disc(SEEN_PX + grow_px), 1.0)
     rows, outwards = matched(edge)
     assert len(rows.vertices) > 0.9 * len(edge.points_px)
@@ -76,18 +79,19 @@ def test_outlines_pull_both_ways_alike(grow_px: int) -> None:
     assert ((rows.gradient * outwards).sum(1) > 0.9).all()
 
 
-def test_what_is_too_far_off_matches_nothing() -> None:
-    """5 px of 1.07 cm each are more than 4 cm."""
+def test_distant_outlines_are_not_matched() -> None:
+    """5 px of 1.07 cm each are more than the limit of 4 cm."""
     assert len(matched(outline(disc(SEEN_PX + 5), 1.0))[0].vertices) == 0
 
 
-def test_outlines_that_face_the_other_way_match_nothing() -> None:
+def test_outlines_with_opposite_normals_are_not_matched() -> None:
     edge = outline(disc(SEEN_PX), 1.0)
     assert len(matched(replace(edge, normals=-edge.normals))[0].vertices) == 0
 
 
 def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pose, list[list[Outline | None]]]:
-    """Return a problem with true keypoints, the true pose, and outlines of a body with 2 cm of cloth on its front."""
+    """Return a fit problem with true keypoints, the true pose, and outlines of a body with 2 cm of cloth on its
+    front."""
     truth, settings = moving_body(tuple(range(frames))), FitSettings()
     names = tuple(str(k) for k in range(cameras))
     capture = record(folder, truth, {name: RING[name] for name in names}, names)
@@ -106,8 +110,8 @@ def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pos
     return problem, pose, edges
 
 
-def test_clothes_that_all_frames_wear_hardly_pull_a_body_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In three steps joints move by 7 mm, and by 16 mm where the body is taken to be naked."""
+def test_clothes_common_to_all_frames_hardly_displace_the_body(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In three steps, joints move by 7 mm; they would move by 16 mm if the body were taken to be naked."""
     monkeypatch.setattr("hnerf.body.clothed_fit.CLOTHED_STEPS", 3)
     problem, pose, edges = clothed_scene(tmp_path, 8, 4)
     found = refine_with_clothing(problem, pose, edges, threads=1)
@@ -116,12 +120,12 @@ def test_clothes_that_all_frames_wear_hardly_pull_a_body_aside(tmp_path: Path, m
 
 
 @pytest.mark.parametrize(("frames", "cameras"), [(8, 1), (7, 2)])
-def test_one_camera_or_few_frames_do_not_tell_clothes(tmp_path: Path, frames: int, cameras: int) -> None:
+def test_clothes_are_not_estimated_from_one_camera_or_few_frames(tmp_path: Path, frames: int, cameras: int) -> None:
     problem, pose, edges = clothed_scene(tmp_path, frames, cameras)
     assert refine_with_clothing(problem, pose, edges, threads=1) is pose
 
 
-def test_frames_side_by_side_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fitting_frames_in_parallel_gives_the_same_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hnerf.body.clothed_fit.CLOTHED_STEPS", 1)
     scene = clothed_scene(tmp_path, 8, 2)
     found, same = (refine_with_clothing(*scene, threads) for threads in (1, 2))

@@ -1,4 +1,4 @@
-"""The mean change of all frames moves into the rest body: a column of two bones, by hand."""
+"""The mean change over all frames moves into the rest body; worked out by hand for a column of two bones."""
 
 import math
 
@@ -12,28 +12,28 @@ from tests.body.boxes import box_rig
 RIG = box_rig(bend_segments=6)
 RIGID = (RIG.skin_weights == 1).any(1)
 TURN = 0.1
-BEND_RAD = (0.0, 0.4)  # of two frames
+BEND_RAD = (0.0, 0.4)  # in each of two frames
 
 
 def bent(angles_rad: tuple[float, ...]) -> Tensor:
-    """Return theta (n, 2, 3): the upper bone turned about x."""
+    """Return theta (n, 2, 3) in which the upper bone turns about x."""
     theta = torch.zeros(len(angles_rad), 2, 3)
     theta[:, 1, 0] = torch.tensor(angles_rad)
     return theta
 
 
 def placed(moved_m: Tensor) -> Tensor:
-    """Return roots (2, 4, 4) of a body that stands, and of one turned to the left by a quarter, each moved along its
-    own axes."""
+    """Return roots (2, 4, 4) of an upright body and of one turned to the left by a quarter, each moved along its own
+    axes."""
     root = torch.eye(4).repeat(2, 1, 1)
     root[1, :3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2]))
     root[:, :3, 3] = (root[:, :3, :3] @ moved_m[..., None])[..., 0]
     return root
 
 
-def test_the_rest_body_turns_as_all_joints_do_in_the_mean() -> None:
-    """Turns of 0.05 and 0.15 bend the rest body by 0.1 and leave -0.05 and 0.05 in the frames. A corner 0.5 m before
-    the joint and 1 m above it turns about the joint."""
+def test_the_rest_body_takes_the_mean_joint_rotation() -> None:
+    """Turns of 0.05 and 0.15 bend the rest body by 0.1 and leave -0.05 and 0.05 in the frames. A corner 0.5 m in front
+    of the joint and 1 m above it turns about the joint."""
     root = placed(torch.zeros(2, 3))
     after = bent((BEND_RAD[0] + TURN - 0.05, BEND_RAD[1] + TURN + 0.05)), root
     rig, theta, stands = with_common_rest(RIG, (bent(BEND_RAD), root), after)
@@ -45,8 +45,8 @@ def test_the_rest_body_turns_as_all_joints_do_in_the_mean() -> None:
     torch.testing.assert_close(stands, root)
 
 
-def test_the_rest_body_moves_as_all_bodies_do_along_their_own_axes() -> None:
-    """1 cm and 3 cm to the left are 2 cm in the mean; the second body faces along another axis of the world."""
+def test_the_rest_body_takes_the_mean_translation_in_body_axes() -> None:
+    """1 cm and 3 cm to the left have a mean of 2 cm. The second body faces along another axis of the world."""
     left_m = torch.tensor([[0.01, 0.0, 0.0], [0.03, 0.0, 0.0]])
     before, theta = placed(torch.zeros(2, 3)), bent(BEND_RAD)
     rig, own, root = with_common_rest(RIG, (theta, before), (theta, placed(left_m)))
@@ -56,8 +56,9 @@ def test_the_rest_body_moves_as_all_bodies_do_along_their_own_axes() -> None:
     torch.testing.assert_close(own, theta, atol=1e-6, rtol=0)
 
 
-def test_bodies_stay_where_they_are() -> None:
-    """Vertices of one bone stay exactly; those between bones move by at most 0.1 rad squared of half a metre."""
+def test_posed_bodies_do_not_change() -> None:
+    """Vertices on one bone stay exactly in place; those between bones move by at most (0.1 rad)^2 times half a
+    metre."""
     generator = torch.Generator().manual_seed(0)
     before = bent(BEND_RAD), placed(torch.zeros(2, 3))
     after = before[0] + 0.0, placed(0.1 * torch.randn(2, 3, generator=generator))

@@ -24,12 +24,12 @@ from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
 SETTINGS = FitSettings(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
-SCALE_M = 3 / 281.6  # of a pixel, at the focal length of `ring_camera` from 3 m away
-SEEN_PX = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)  # radius at which a ball of 0.2 m looks
+SCALE_M = 3 / 281.6  # metres per pixel at 3 m with the focal length of `ring_camera`
+SEEN_PX = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)  # radius of a ball of 0.2 m in the image
 
 
 def ball(radius_m: float, height_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and faces of a sphere on the axis."""
+    """Return vertices and faces of a sphere centred on the z axis."""
     rings, around = 24, 48
     polar, turn = np.meshgrid(
         np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, around, endpoint=False), indexing="ij"
@@ -47,7 +47,8 @@ def disc(radius_px: float, size_px: int = 256) -> np.ndarray:
 
 
 def matched(mask: np.ndarray) -> tuple[ContourResiduals, np.ndarray]:
-    """Return how a ball of 0.2 m before a camera matches a mask, and the outward directions of the matched vertices."""
+    """Return the match of a ball of 0.2 m in front of a camera with a mask, and the outward directions of the matched
+    vertices."""
     vertices, faces = ball(0.2, 1.0)
     normals, camera = normals_of(vertices, faces), ring_camera("a", 0.3)
     rows = match(camera, outline(mask, 1.0), SCALE_M, vertices, normals, faces, SETTINGS)
@@ -55,19 +56,20 @@ def matched(mask: np.ndarray) -> tuple[ContourResiduals, np.ndarray]:
 
 
 def test_an_outline_runs_between_the_pixels_and_points_outwards() -> None:
-    """A mask of columns 10 to 19 and rows 10 to 29 has its edges at 9.5, 19.5, 9.5 and 29.5."""
+    """A mask of columns 10 to 19 and rows 10 to 29 has edges at columns 9.5 and 19.5 and rows 9.5 and 29.5."""
     mask = np.zeros((40, 40), bool)
     mask[10:30, 10:20] = True
     edge = outline(mask, 1.0)
     left = (edge.points_px[:, 0] < 12) & (np.abs(edge.points_px[:, 1] - 19.5) < 5)
     np.testing.assert_allclose(edge.points_px[left, 0], 9.5, atol=0.05)
     np.testing.assert_allclose(edge.normals[left], np.tile([-1, 0], (left.sum(), 1)), atol=0.05)
-    assert 50 <= len(edge.points_px) <= 60  # one a pixel along a perimeter of 60 with rounded corners
+    assert 50 <= len(edge.points_px) <= 60  # one point per pixel along a perimeter of 60 px with rounded corners
     assert edge.distance_px[20, 10] == -0.5 and edge.distance_px[20, 9] == 0.5 and edge.distance_px[20, 5] == 4.5
 
 
-def test_distances_at_every_third_pixel_are_those_of_all_pixels_between_them() -> None:
-    """To the right of a disc of 20 px around (128, 128), in a picture whose last column is not kept."""
+def test_sparse_distance_maps_interpolate_the_full_ones() -> None:
+    """Distances to the right of a disc of 20 px around (128, 128) are stored at every third pixel, in an image whose
+    last column is not one of them."""
     full, sparse = (outline(disc(20), 1.0, stride) for stride in (1, 3))
     assert (full.distance_px.shape, sparse.distance_px.shape) == ((256, 256), (86, 86))
     along_px = np.stack([np.linspace(140, 254, 50), np.full(50, 128.0)], 1)
@@ -87,25 +89,26 @@ def test_normals_point_out_of_a_ball() -> None:
 
 
 def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() -> None:
-    """A ball of 0.2 m at 3 m, 281.6 px focal length, looks 18.8 px large; the masks are 5 px larger and smaller."""
+    """A ball of 0.2 m at 3 m with a focal length of 281.6 px has a radius of 18.8 px. The masks are 5 px larger and
+    smaller."""
     for grow_px, sigma_m in ((5, 0.02), (-5, 0.01)):
         rows, outwards = matched(disc(SEEN_PX + grow_px))
         assert len(rows.vertices) > 20
         np.testing.assert_allclose(np.abs(rows.residual_m).max(), 5 * SCALE_M, atol=0.6 * SCALE_M)
-        assert (-np.sign(grow_px) * rows.residual_m > 2 * SCALE_M).all()  # rim vertices lie up to 2.5 px deep
+        assert (-np.sign(grow_px) * rows.residual_m > 2 * SCALE_M).all()  # rim vertices lie up to 2.5 px inside
         fades, holds = 1 / (1 + (rows.residual_m / 0.1) ** 2) ** 2, 0.01345 / np.abs(rows.residual_m)
         robust = fades if grow_px > 0 else np.minimum(1, holds)
         np.testing.assert_allclose(rows.weight, robust / sigma_m**2)
-        assert ((rows.gradient * outwards).sum(1) > 0.9).all()  # moving out raises the residual, metre for metre
+        assert ((rows.gradient * outwards).sum(1) > 0.9).all()  # moving outwards raises the residual 1:1
 
 
 def test_a_body_that_fills_its_mask_is_left_alone() -> None:
     assert np.abs(matched(disc(SEEN_PX))[0].residual_m).max() < SCALE_M
 
 
-def test_a_part_that_a_mask_lacks_pushes_no_harder_than_one_that_sticks_out_a_little() -> None:
-    """Half of the mask is missing. Beyond 1.345 standard deviations of 0.01 m every vertex outside pushes with 1.345 /
-    0.01 m."""
+def test_the_push_of_vertices_outside_the_mask_is_bounded() -> None:
+    """Half of the mask is missing. Every vertex that is outside by more than 1.345 standard deviations of 0.01 m pushes
+    with 1.345 / 0.01 m."""
     seen = disc(SEEN_PX)
     seen[:, 128:] = False
     rows, _ = matched(seen)
@@ -114,9 +117,9 @@ def test_a_part_that_a_mask_lacks_pushes_no_harder_than_one_that_sticks_out_a_li
     np.testing.assert_allclose((rows.weight * rows.residual_m)[out], 134.5)
 
 
-def test_a_hand_before_the_trunk_has_no_outline() -> None:
-    """A small ball half a metre before a large one, as seen from the camera, has its rim in the middle of the large
-    one's silhouette."""
+def test_a_hand_in_front_of_the_trunk_has_no_outline() -> None:
+    """A small ball is half a metre in front of a large one, as seen by the camera. Its rim lies inside the large ball's
+    silhouette."""
     camera, (trunk_m, faces), (hand_m, _) = ring_camera("a", 0.3), ball(0.2, 1.0), ball(0.05, 1.0)
     hand_m = hand_m + 0.5 * np.array([np.cos(0.3), np.sin(0.3), 0])
     both_m, both = np.concatenate([trunk_m, hand_m]), np.concatenate([faces, faces + len(trunk_m)])
@@ -125,8 +128,8 @@ def test_a_hand_before_the_trunk_has_no_outline() -> None:
     assert len(_rim(camera, hand_m, normals_of(hand_m, faces), faces)) > 20
 
 
-def test_the_outline_goes_on_where_the_picture_ends() -> None:
-    """Of a ball in the middle, a picture of half the width shows the left half."""
+def test_the_rim_continues_beyond_the_image_border() -> None:
+    """An image of half the width shows only the left half of a ball in the middle."""
     camera, (vertices, faces) = ring_camera("a", 0.3), ball(0.2, 1.0)
     half, normals = dataclasses.replace(camera, width_px=128), normals_of(vertices, faces)
     rim, seen = (_rim(c, vertices, normals, faces) for c in (camera, half))
@@ -135,17 +138,19 @@ def test_the_outline_goes_on_where_the_picture_ends() -> None:
         assert side.sum() > 10 and np.isin(rim[side], seen).all()
 
 
-def test_a_contour_pulls_what_is_inside_it_and_faces_its_way() -> None:
-    """An edge whose outside is up has a rim 3 px inside, one 3 px outside, and one 3 px inside that faces right."""
+def test_an_outline_pulls_rim_vertices_inside_it_with_matching_normals() -> None:
+    """The outside of an edge is up. One rim vertex is 3 px inside, one 3 px outside, and one 3 px inside but facing
+    right."""
     edge = Outline(np.array([[10.0, 0], [20, 0], [30, 0]]), np.tile([0.0, -1], (3, 1)), (1, 1), np.zeros((1, 1)))
     rim_px = np.array([[10.0, 3], [20, -3], [30, 3]])
     ids, direction, signed_px = _cover(edge, rim_px, np.array([[0.0, -1], [0, -1], [1, 0]]))
     assert (ids.tolist(), direction.tolist(), signed_px.tolist()) == ([0], [[0, -1]], [-3])
 
 
-def test_one_vertex_of_a_cell_is_pushed_back_to_the_mask() -> None:
-    """A disc of 20 px in the middle of 256 x 200 pixels: to its right are two rim vertices in one cell of 2 px, below
-    it another one, in a cell whose row and column add up to the same; one lies within, one beyond the picture."""
+def test_one_vertex_per_cell_is_pushed_back_to_the_mask() -> None:
+    """A disc of 20 px lies in an image of 256 x 200 px. To its right are two rim vertices in one cell of 2 px. Below it
+    are two in separate cells; the row and column of one of these add up to the same as in the first cell. One vertex is
+    inside the disc, one outside the image."""
     edge = outline(disc(20)[:200], 1.0)
     rim_px = np.array([[200.0, 128], [200.4, 128.3], [128, 190], [138, 190], [130, 130], [300, 128]])
     ids, direction, distance_px = _contain(edge, rim_px, 2.0)
@@ -155,8 +160,9 @@ def test_one_vertex_of_a_cell_is_pushed_back_to_the_mask() -> None:
     np.testing.assert_allclose(distance_px[[right, below]], [52, 42], atol=1)
 
 
-def test_residuals_enter_the_normal_equations_twice_if_added_twice() -> None:
-    """Along any direction through pose and shape, gradient and curvature are those of the sums of w (r + g . dx)^2."""
+def test_residuals_add_gradient_and_curvature_to_the_normal_equations() -> None:
+    """Residuals added twice count twice. Along any direction through pose and shape, gradient and curvature are those
+    of the sum of w (r + g . dx)^2."""
     rig, frame, step = two_bone_rig(), 1, 1e-6
     articulation, pose = Articulation(rig), random_pose(rig, 2)
     random = np.random.default_rng(0)
@@ -183,9 +189,10 @@ def test_residuals_enter_the_normal_equations_twice_if_added_twice() -> None:
 
 
 def test_a_sole_is_as_thick_as_the_mask_reaches_below_the_foot() -> None:
-    """A camera 1 m high looks level at the axis 3 m away; 0.3 m lower is 28.16 px below the middle of the image, row
-    156.16. A mask that ends at row 159.5 reaches 3.34 px farther, of 3 / 281.6 m each. A toe higher above the ground
-    than 15 mm does not count, nor does a mask that ends above the foot; a sole is 5 cm thick at most."""
+    """A camera at a height of 1 m looks horizontally at the axis, 3 m away. A foot 0.3 m lower is 28.16 px below the
+    image's middle, at row 156.16. A mask that ends at row 159.5 reaches 3.34 px farther down, of 3 / 281.6 m each. A
+    toe more than 15 mm above the ground is ignored. A mask that ends above the foot gives a sole of 0; a sole is at
+    most 5 cm thick."""
     camera, scale_m = ring_camera("a", 0.3), 3 / 281.6
     foot = np.array([[0, 0, 0.7], [0, 0, 0.8], [1.0, 0.3, 0.716]])
 
@@ -198,9 +205,9 @@ def test_a_sole_is_as_thick_as_the_mask_reaches_below_the_foot() -> None:
     np.testing.assert_allclose([sole_to(150), sole_to(200)], [0, 0.05], rtol=1e-6)
 
 
-def test_a_sole_is_below_the_vertex_that_is_lowest_in_the_picture() -> None:
-    """Of two vertices on the ground, 3 m and 2.8 m away, the nearer is lower: row 127.5 + 281.6 / 2.8 = 228.07, in
-    either order. The mask ends at row 234.5."""
+def test_a_sole_is_measured_below_the_vertex_lowest_in_the_image() -> None:
+    """Of two vertices on the ground, 3 m and 2.8 m away, the nearer one is lower in the image: row 127.5 + 281.6 / 2.8
+    = 228.07, in either order. The mask ends at row 234.5."""
     camera, mask = ring_camera("a", 0.0), np.zeros((256, 256), bool)
     mask[20:235, 20:236] = True
     foot = np.array([[0, 0, 0.0], [0.2, 0, 0.005]])
@@ -212,8 +219,8 @@ def test_a_sole_is_below_the_vertex_that_is_lowest_in_the_picture() -> None:
         assert abs(rows.max() - rows.min()) > 5
 
 
-def test_a_foot_beyond_the_picture_has_no_sole() -> None:
-    """As above, the foot is in row 156.16: 0.84, 1.84 and 2.84 px above the last row of three pictures."""
+def test_a_foot_near_the_image_border_has_no_sole() -> None:
+    """As above, the foot is at row 156.16: 0.84, 1.84 and 2.84 px above the last row of three images."""
     foot, mask = np.array([[0, 0, 0.7]]), np.ones((256, 256), bool)
     for height_px, seen in ((158, False), (159, False), (160, True)):
         camera = dataclasses.replace(ring_camera("a", 0.3), height_px=height_px)
@@ -222,7 +229,8 @@ def test_a_foot_beyond_the_picture_has_no_sole() -> None:
 
 
 def test_a_sole_stands_on_the_ground() -> None:
-    """5 cm above the ground with a sole of 2 cm: 3 cm to fall, at 1 / 0.01^2 over (1 + 0.2^2)^2."""
+    """A foot 5 cm above the ground with a sole of 2 cm should fall by 3 cm, with a weight of 1 / 0.01^2 over (1 +
+    0.2^2)^2."""
     rows = _ground_contact(np.array([[0, 0, 0.3], [0, 0.1, 0.05]]), 2, 0.02)
     assert rows.vertices.tolist() == [1] and rows.gradient.tolist() == [[0, 0, 1]]
     np.testing.assert_allclose([rows.residual_m[0], rows.weight[0]], [0.03, 1e4 / 1.04**2])

@@ -1,4 +1,5 @@
-"""The descriptor (d, s): worked out by hand on a box, fast against reference, gradients against finite differences."""
+"""The descriptor (d, s): by hand on a box, the fast form against the reference, gradients against finite
+differences."""
 
 import dataclasses
 
@@ -17,9 +18,9 @@ from tests.body.reference import closest_points_reference, on_surface, solid_ang
 
 @pytest.mark.parametrize("exact", [False, True])
 @pytest.mark.parametrize("moved_m", [0.0, 1.0])
-def test_box_by_hand(exact: bool, moved_m: float):
-    """From (2, 0.5, 0.5) the unit box is 1 m away, nearest at (1, 0.5, 0.5); its centre lies 0.5 m inside. If the box
-    and the points move along x, so does what is found."""
+def test_closest_points_of_a_box_by_hand(exact: bool, moved_m: float):
+    """The point (2, 0.5, 0.5) is 1 m from the unit box, nearest to (1, 0.5, 0.5). The second point is inside, 0.4 m
+    above the bottom. If the box and the points move along x, so do the closest points."""
     away = torch.tensor([moved_m, 0.0, 0.0])
     vertices, faces, points = box_vertices(), box_faces(), torch.tensor([[2.0, 0.5, 0.5], [0.5, 0.5, 0.4]])
     meshes = BodyMeshes(vertices[None], faces)
@@ -31,7 +32,7 @@ def test_box_by_hand(exact: bool, moved_m: float):
     assert found.sign.tolist() == [1.0, -1.0]
 
 
-def test_out_of_reach_is_said():
+def test_points_out_of_reach_have_face_minus_one():
     found = BodyMeshes(box_vertices()[None], box_faces()).closest_points(
         torch.tensor([[2.0, 0.5, 0.5]]), torch.zeros(1, dtype=torch.int32), 0.9
     )
@@ -48,8 +49,8 @@ def test_solid_angle_of_a_closed_surface():
 
 
 @pytest.mark.parametrize("exact", [False, True])
-def test_fast_form_agrees_with_the_reference(exact: bool):
-    """Points all around a posed body have the same distances, and the same sign at every point."""
+def test_fast_closest_points_match_the_reference(exact: bool):
+    """Points all around a posed body have the same distances and the same signs."""
     rig = box_rig(bend_segments=6)
     theta = torch.zeros(1, 2, 3)
     theta[0, 1] = torch.tensor([0.0, 0.7, 0.0])
@@ -69,8 +70,8 @@ def test_fast_form_agrees_with_the_reference(exact: bool):
 
 
 def test_exact_sign_inside_a_body_that_intersects_itself():
-    """Two unit boxes overlap from x = 0.6 to 1: at x = 0.55 the nearest surface is the second box's buried wall, and
-    the point is outside that wall, but inside the first box."""
+    """Two unit boxes overlap from x = 0.6 to 1. At x = 0.55 the nearest surface is the second box's buried wall. The
+    point is outside that wall, but inside the first box."""
     vertices = torch.cat([box_vertices(), box_vertices() + torch.tensor([0.6, 0.0, 0.0])])
     faces = torch.cat([box_faces(), box_faces() + 8])
     point, row = torch.tensor([[0.55, 0.5, 0.5]]), torch.zeros(1, dtype=torch.int32)
@@ -79,8 +80,8 @@ def test_exact_sign_inside_a_body_that_intersects_itself():
     assert closest_points_reference(point, vertices, faces, 5.0).sign.tolist() == [-1.0]
 
 
-def test_exact_sign_around_and_inside_of_surfaces_that_cross():
-    """Two coarse balls of radius 1 move until their middles are 1.7 apart: many faces are buried in part."""
+def test_exact_sign_around_and_inside_intersecting_surfaces():
+    """Two coarse balls of radius 1 move until their centres are 1.7 apart, so many faces are partly buried."""
     ball = trimesh.creation.icosphere(subdivisions=1)
     sphere, faces = torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces)
     faces = torch.cat([faces, faces + len(sphere)])
@@ -95,7 +96,7 @@ def test_exact_sign_around_and_inside_of_surfaces_that_cross():
 
 
 def test_canonical_position_undoes_the_pose():
-    """For a rigidly turned and moved body y is the point moved back, and d is unchanged."""
+    """For a rigidly turned and moved body, y is the point moved back, and d is unchanged."""
     rig = box_rig()
     root = torch.eye(4)
     root[:3, :3] = rotation_from_axis_angle(torch.tensor([0.3, -0.5, 0.8]))
@@ -110,9 +111,9 @@ def test_canonical_position_undoes_the_pose():
 
 
 @pytest.mark.parametrize("name, index", [("move_m", (0, 2)), ("turn", (0, 1, 0)), ("turn", (0, 0, 1))])
-def test_gradient_to_the_pose(name: str, index: tuple[int, ...]):
-    """dd and dy of the learned correction agree with really moving the body (absorb) and describing the points
-    again."""
+def test_gradients_by_the_pose_match_finite_differences(name: str, index: tuple[int, ...]):
+    """Gradients of d and y by the learned correction agree with finite differences: move the body (absorb) and describe
+    the points again."""
     step = 1e-3
     rig = box_rig(bend_segments=6)
     theta = torch.zeros(1, 2, 3)
@@ -139,7 +140,7 @@ def test_gradient_to_the_pose(name: str, index: tuple[int, ...]):
             assert gradient.item() == pytest.approx(((ahead.y - behind.y)[k, axis] / (2 * step)).item(), abs=2e-2)
 
 
-RIGID_POINTS = [[0.5, 0.4, 2.15], [1.15, 0.5, 1.8], [0.4, -0.1, 1.9], [0.45, 0.6, 1.93]]  # where one bone carries all
+RIGID_POINTS = [[0.5, 0.4, 2.15], [1.15, 0.5, 1.8], [0.4, -0.1, 1.9], [0.45, 0.6, 1.93]]  # near one bone only
 
 
 def growing_box() -> Rig:
@@ -150,8 +151,8 @@ def growing_box() -> Rig:
 
 
 def reference_distance(points: Tensor, turn: Tensor, move: Tensor, beta: Tensor) -> Tensor:
-    """Return d by every triangle, in double precision, of the column bent by 0.4 rad and then turned, moved and
-    reshaped."""
+    """Return d of the column, bent by 0.4 rad and then turned, moved and reshaped, by trying every triangle in double
+    precision."""
     rig = growing_box().reshaped(beta)
     theta = torch.zeros(1, 2, 3, dtype=torch.float64)
     theta[0, 1] = axis_angle_from_rotation(rotation_from_axis_angle(turn) @ rotation_from_axis_angle(BENT))
@@ -168,7 +169,7 @@ BENT = torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64)
 @pytest.mark.parametrize("unknown", ["x", "theta", "T", "beta"])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_gradients_agree_with_finite_differences_in_double_precision(unknown: str, axis: int):
-    """Gradients of the fast form by x, theta, T and beta agree with central differences of the plain reference."""
+    """Gradients of the fast form by x, theta, T and beta agree with central differences of the reference."""
     rig = growing_box()
     theta = torch.zeros(1, 2, 3, dtype=torch.float64)
     theta[0, 1] = BENT
@@ -199,8 +200,8 @@ def test_gradients_agree_with_finite_differences_in_double_precision(unknown: st
     torch.testing.assert_close(found, (moved(step) - moved(-step)) / (2 * step), atol=1e-5, rtol=0)
 
 
-def test_gradient_to_the_shape():
-    """A shape that lifts the top by 1 m a unit: the distance above it shrinks at rate 1."""
+def test_gradient_by_the_shape_by_hand():
+    """The shape lifts the top by 1 m per unit, so the distance of a point above it shrinks at rate 1."""
     rig = box_rig()
     bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
     correction = bodies.correction()
@@ -213,12 +214,12 @@ def test_gradient_to_the_shape():
     ("point", "follows"),
     [
         ([0.4, 0.3, 1.2], [1.0, 1.0, 0.0]),  # above the top face
-        ([1.1, 0.3, 1.2], [0.0, 1.0, 0.0]),  # beside its edge along y
-        ([1.1, -0.2, 1.2], [0.0, 0.0, 0.0]),  # beside its corner
+        ([1.1, 0.3, 1.2], [0.0, 1.0, 0.0]),  # off its edge along y
+        ([1.1, -0.2, 1.2], [0.0, 0.0, 0.0]),  # off its corner
     ],
 )
 def test_the_closest_point_follows_along_face_and_edge(point: list[float], follows: list[float]):
-    """ds_k / dx_k of a unit box is as worked out, and agrees with finite differences."""
+    """ds_k / dx_k of a unit box has the values worked out by hand, and agrees with finite differences."""
     rig = box_rig()
     bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
     x, step, only = torch.tensor([point], requires_grad=True), 1e-2, torch.zeros(1, dtype=torch.int32)
@@ -230,8 +231,9 @@ def test_the_closest_point_follows_along_face_and_edge(point: list[float], follo
         assert (ahead - behind).item() / (2 * step) == pytest.approx(follows[k], abs=1e-4)
 
 
-def test_of_one_posture_what_was_turned_is_kept():
-    """Two frames turned by +0.02 and -0.02 rad turn by nothing together; 0.04 more in one are 0.02 in both."""
+def test_frames_of_one_posture_share_their_mean_rotation():
+    """Two frames turned by +0.02 and -0.02 rad have a mean of 0. Turned by +0.02 and 0.06 rad, both get the mean of
+    0.04."""
     rig = box_rig()
     bodies = PosedBodies(rig, torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1), rig.vertices_m)
     correction = bodies.correction()
@@ -243,7 +245,7 @@ def test_of_one_posture_what_was_turned_is_kept():
         torch.testing.assert_close(correction.totals()[0][:, 0, 0], torch.full((2,), mean))
 
 
-def test_absorbing_keeps_the_total():
+def test_absorbing_a_correction_keeps_its_total():
     rig = box_rig()
     bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
     correction = bodies.correction()
@@ -266,8 +268,8 @@ def test_logarithm_of_a_half_turn():
     torch.testing.assert_close(found.abs(), torch.tensor([0.0, 0.0, torch.pi]))
 
 
-def test_points_beside_are_described_as_if_they_had_been_asked_for() -> None:
-    """Above a face of a turned box, which is flat, the first order is exact."""
+def test_first_order_descriptors_of_offset_points_match_exact_ones() -> None:
+    """Above a face of a rotated box, which is flat, the first order is exact."""
     rig = box_rig()
     root = torch.eye(4)[None]
     root[0, :2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
@@ -281,8 +283,8 @@ def test_points_beside_are_described_as_if_they_had_been_asked_for() -> None:
 
 
 def test_a_shape_moves_vertices_as_skinning_does() -> None:
-    """In a bent pose of the whole body, where joints move with the shape, the linear displacement of each vertex equals
-    that of skinning the other shape, to float accuracy, as skinning is linear in the shape."""
+    """The whole body is in a bent pose, and joints move with the shape. The linear displacement of each vertex equals
+    the result of skinning the other shape, because skinning is linear in the shape."""
     rig = anny_rig().to(dtype=torch.float64)
     generator = torch.Generator().manual_seed(2)
     theta = torch.randn(1, len(rig.joints_m), 3, generator=generator, dtype=torch.float64) * 0.4 * rig.free[:, None]
@@ -298,7 +300,8 @@ def test_a_shape_moves_vertices_as_skinning_does() -> None:
 
 
 def test_blending_by_hand_and_its_gradient_in_double():
-    """Rows 1 and 2 count a quarter and three quarters, row 0 twice; the gradient of a row is the sum of its weights."""
+    """Rows 1 and 2 are blended with weights of a quarter and three quarters; row 0 is used twice. The gradient of a row
+    is the sum of its weights."""
     rows = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]], dtype=torch.float64, requires_grad=True)
     corners, weights = torch.tensor([[1, 2], [0, 0]]), torch.tensor([[0.25, 0.75], [0.5, 0.5]])
     mixed = weighted_sum(rows, corners, weights)
@@ -309,8 +312,8 @@ def test_blending_by_hand_and_its_gradient_in_double():
     assert torch.autograd.gradcheck(lambda r: weighted_sum(r, corners, weights), (rows,))
 
 
-def test_distinct_rows_are_those_of_unique():
-    """Of six rows, 1 and 4 occur; -1 is the last one."""
+def test_distinct_rows_and_their_indices():
+    """Of six rows, 1 and 4 occur. Row -1 means the last one."""
     present, own = distinct_rows(torch.tensor([4, 1, 1, 4]), 6)
     assert (present.tolist(), own.tolist()) == ([1, 4], [1, 0, 0, 1])
     present, own = distinct_rows(torch.tensor([2, -1]), 6)

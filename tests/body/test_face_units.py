@@ -9,17 +9,17 @@ from hnerf.body.rig import Rig
 from tests.asset.figure import column_rig
 
 
-def test_units_have_the_names_of_arkit_and_all_move_something(rig: Rig) -> None:
+def test_face_units_have_arkit_names_and_all_move_vertices(rig: Rig) -> None:
     units = face_units_m(rig)
     assert len(units) == 51 and "tongueOut" not in units
     assert {"jawOpen", "eyeBlinkLeft", "mouthSmileRight", "browInnerUp", "noseSneerLeft", "cheekPuff"} <= set(units)
     assert all(unit.shape == (len(rig.vertices_m), 3) and unit.any() for unit in units.values())
 
 
-def test_units_do_what_their_names_say(rig: Rig) -> None:
+def test_face_units_match_their_names(rig: Rig) -> None:
     units = face_units_m(rig)
     jaw = units["jawOpen"][np.linalg.norm(units["jawOpen"], axis=1).argmax()]
-    assert jaw[2] < -0.02 and abs(jaw[0]) < 0.005  # down
+    assert jaw[2] < -0.02 and abs(jaw[0]) < 0.005  # the jaw moves down
     for side, sign in (("Left", 1), ("Right", -1)):
         blink, smile = (units[f"{name}{side}"] for name in ("eyeBlink", "mouthSmile"))
         lid = np.linalg.norm(blink, axis=1).argmax()
@@ -30,7 +30,7 @@ def test_units_do_what_their_names_say(rig: Rig) -> None:
     assert units["jawForward"][:, 1].max() < 0.001
 
 
-def test_a_smaller_face_moves_less(rig: Rig) -> None:
+def test_displacements_scale_with_the_size_of_the_face(rig: Rig) -> None:
     beta = torch.tensor(ADULT)
     beta[1] = 0.4
     child = anny_rig(beta)
@@ -42,7 +42,7 @@ def test_a_smaller_face_moves_less(rig: Rig) -> None:
     np.testing.assert_allclose(childs, scale * adults, atol=1e-7)
 
 
-def test_eyeballs_do_not_move_and_other_bodies_have_no_units(rig: Rig) -> None:
+def test_face_units_do_not_move_eyeballs_and_exist_only_for_anny(rig: Rig) -> None:
     base = base_mesh(rig)
     assert base.face_units_m["jawOpen"].shape == (len(base.rig.vertices_m), 3)
     assert not base.face_units_m["eyeLookDownLeft"][len(rig.vertices_m) :].any()

@@ -36,12 +36,12 @@ RING = recorded_body.RING | {"test": ring_camera("test", 1.0)}
 
 @pytest.fixture
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """End fits to keypoints early: what is asked of them is clear by then."""
+    """Stop fits to keypoints early; the results are accurate enough for these tests."""
     monkeypatch.setattr("hnerf.body.fit.KEYPOINT_STEPS", 8)
 
 
 def joint_error_m(a: BodyFit, b: BodyFit) -> torch.Tensor:
-    """Return distances (n, free joints)."""
+    """Return distances (n, free joints) between the joints of two fits."""
     where = [joint_transforms(body.rig, body.theta, body.root)[..., :3, 3] for body in (a, b)]
     return (where[0] - where[1]).norm(dim=-1)[:, a.rig.free]
 
@@ -60,7 +60,9 @@ def test_four_cameras_recover_pose_and_shape(tmp_path: Path) -> None:
     assert fit.frames == (0, 1, 2) and not fit.theta[:, ~fit.rig.free].any()
 
 
-def test_the_distances_of_all_outlines_stay_within_their_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_distance_maps_of_outlines_stay_within_their_memory_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     truth = moving_body((0, 1))
     capture = record(tmp_path, truth, RING, ("0", "1", "2", "3"))
     width_px, height_px = capture.cameras["0"].size_px
@@ -71,8 +73,8 @@ def test_the_distances_of_all_outlines_stay_within_their_bytes(tmp_path: Path, m
         assert [[edge.stride for edge in row if edge] for row in edges] == [[stride] * 4] * 2
 
 
-def test_a_frame_that_nothing_was_fitted_to_is_poor(tmp_path: Path) -> None:
-    """Frame 1 has no keypoints, and there are no masks; with masks, it is what these say."""
+def test_a_frame_without_observations_is_reported_as_poor(tmp_path: Path) -> None:
+    """Frame 1 has no keypoints. Without masks it is poor; with masks, they decide."""
     truth = moving_body((0, 1, 2))
     capture = record(tmp_path, truth, RING, ("0", "1"))
     seen = observe(capture)
@@ -85,7 +87,8 @@ def test_a_frame_that_nothing_was_fitted_to_is_poor(tmp_path: Path) -> None:
 
 
 def test_one_camera_finds_the_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the lower foot first; once the pose is known, by both, before the outlines' six steps and in them."""
+    """At first only the lower foot stands on the ground. Once the pose is known, each foot does: before the six steps
+    on outlines, and in them."""
     truth, stands, each_foot = moving_body((0, 1, 2, 3)), Ground.add, []
     monkeypatch.setattr(Ground, "add", lambda self, *given: each_foot.append(self.each_foot) or stands(self, *given))
     capture = record(tmp_path, truth, RING, ("0",))
@@ -96,28 +99,28 @@ def test_one_camera_finds_the_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.usefixtures("few_steps")
-def test_one_camera_finds_the_stature_where_height_0_is_not_the_ground(tmp_path: Path) -> None:
+def test_one_camera_finds_the_stature_if_height_0_is_not_the_ground(tmp_path: Path) -> None:
     """The world's origin is a board on a table, 0.7 m above the floor."""
     truth = moving_body((0, 1))
     capture = record(tmp_path, truth, RING, ("0",))
     below = capture.with_cameras({n: replace(c, t_m=c.t_m + c.R @ [0, 0, 0.7]) for n, c in capture.cameras.items()})
     _, report = fit_body(below, None, FitSettings())
-    assert 1.6 < report["stature_m"] < 2.0  # as the prior has it
+    assert 1.6 < report["stature_m"] < 2.0  # near the prior
 
 
 @pytest.mark.usefixtures("few_steps")
-def test_a_stature_that_is_stated_wins_over_the_usual_one(tmp_path: Path) -> None:
-    """Somebody of 1.83 m is taken for a child of 1.4 m, nearer to the camera, if `capture.toml` says so: on height 0 he
-    would be 1.3 times as tall."""
+def test_a_stated_stature_overrides_the_ground(tmp_path: Path) -> None:
+    """A person of 1.83 m is taken for a child of 1.4 m who is nearer to the camera, because `capture.toml` says so.
+    Standing on height 0, the person would be 1.3 times as tall."""
     capture = replace(record(tmp_path, moving_body((0, 1)), RING, ("0",)), stature_m=1.4)
     _, report = fit_body(capture, None, FitSettings())
     assert not report["on_ground"] and abs(report["stature_m"] - 1.4) < 0.05
 
 
-def test_a_stature_that_one_camera_tells_is_doubted_beyond_one_and_a_half_standard_deviations(
+def test_an_unlikely_stature_from_one_camera_is_warned_about(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """1.72 m + 1.5 x 8 cm are 1.84 m."""
+    """The limit is one and a half standard deviations: 1.72 m + 1.5 x 8 cm = 1.84 m."""
     settings = FitSettings(stature_m=1.72, stature_std_m=0.08)
     for stature_m, words in ((1.83, ""), (1.61, ""), (1.85, "1.85 m tall, 1.72 m expected")):
         caplog.clear()
@@ -126,7 +129,7 @@ def test_a_stature_that_one_camera_tells_is_doubted_beyond_one_and_a_half_standa
 
 
 @pytest.mark.usefixtures("few_steps")
-def test_who_stated_a_stature_is_not_asked_to_state_it(
+def test_the_stature_warning_depends_on_whether_one_was_stated(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hnerf.body.fit.MAX_STATURE_SIGMAS", 0)
@@ -138,7 +141,7 @@ def test_who_stated_a_stature_is_not_asked_to_state_it(
 
 
 @pytest.mark.usefixtures("few_steps")
-def test_before_one_camera_somebody_stands_on_his_soles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_one_camera_the_soles_stand_on_the_ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(contour_fit, "_sole_m", lambda *_: 0.03)
     truth = moving_body((0, 1))
     truth.root[:, 2, 3] += 0.03
@@ -148,14 +151,14 @@ def test_before_one_camera_somebody_stands_on_his_soles(tmp_path: Path, monkeypa
 
 
 @pytest.mark.usefixtures("few_steps")
-def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
+def test_an_arm_mirrored_in_depth_is_corrected_from_neighbouring_frames(tmp_path: Path) -> None:
     truth, settings = moving_body((0, 1, 2)), FitSettings()
     capture = record(tmp_path, truth, RING, ("0",))
     seen = observe(capture)
     smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 30.0))
     pose = true_pose(truth)
     problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=0.1)
-    problem = replace(problem, reshape=pose.rig.reshaped)  # half of a step would be anny's shape
+    problem = replace(problem, reshape=pose.rig.reshaped)  # faster: anny's own reshaping takes half of a step
     pose = levenberg_marquardt(problem, pose, problem.image_term, 15)
     mirrored_theta = pose.theta.clone()
     mirrored_theta[1, truth.rig.joint_names.index("upperarm01.L")] += torch.tensor([0.0, 2.0, 0.0])
@@ -174,8 +177,11 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cameras", [("0",), ("0", "1", "2", "3")])
 @pytest.mark.usefixtures("few_steps")
-def test_keypoints_alone_and_a_lone_frame_that_is_hardly_seen(tmp_path: Path, cameras: tuple[str, ...]) -> None:
-    """Frame 9 has no neighbours in time, and stays near the others; one camera of four sees it, or none at all."""
+def test_a_fit_to_keypoints_handles_an_isolated_frame_that_is_hardly_seen(
+    tmp_path: Path, cameras: tuple[str, ...]
+) -> None:
+    """Frame 9 has no neighbours in time and stays near the others. It is seen by one camera of four, or, with a single
+    camera, not at all."""
     truth = moving_body((0, 1, 9))
     capture = record(tmp_path, truth, RING, cameras)
     with edited_keypoints(tmp_path) as keypoints:
@@ -188,7 +194,7 @@ def test_keypoints_alone_and_a_lone_frame_that_is_hardly_seen(tmp_path: Path, ca
     assert report["silhouette_iou"] is None and "outlines" not in report["seconds"]
 
 
-def test_a_person_seen_by_too_few_cameras_is_bad_input(tmp_path: Path) -> None:
+def test_a_person_seen_by_too_few_cameras_is_refused(tmp_path: Path) -> None:
     capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))
     with edited_keypoints(tmp_path) as keypoints:
         keypoints["1"][1:, ..., 2] = 0
@@ -199,7 +205,7 @@ def test_a_person_seen_by_too_few_cameras_is_bad_input(tmp_path: Path) -> None:
         fit_body(capture, None, FitSettings())
 
 
-def test_frames_before_the_person_comes_do_not_count(tmp_path: Path) -> None:
+def test_frames_before_the_person_enters_do_not_count(tmp_path: Path) -> None:
     capture = record(tmp_path, moving_body((0, 1, 2, 3, 4)), RING, ("0", "1"))
     with edited_keypoints(tmp_path) as keypoints:
         for seen in keypoints.values():
@@ -215,18 +221,19 @@ def test_runs_break_at_gaps_and_between_two_splits(tmp_path: Path) -> None:
     assert runs(replace(capture, train_frames=(0,), novel_pose_frames=(1, 2, 5, 6))) == [(0,), (1, 2), (5, 6)]
 
 
-def test_frames_of_a_stride_follow_each_other(tmp_path: Path) -> None:
+def test_frames_with_a_stride_form_one_run(tmp_path: Path) -> None:
     capture = record(tmp_path, moving_body((0, 3, 6, 15, 18)), RING, ("0",))
     assert runs(capture) == [(0, 3, 6), (15, 18)]
 
 
-def test_unevenly_spaced_frames_follow_each_other(tmp_path: Path) -> None:
-    """The median of 2, 4, 2, 2, 5, 1 is 2, of which 4 are two, and 5 more than two."""
+def test_unevenly_spaced_frames_form_runs(tmp_path: Path) -> None:
+    """The median of the gaps 2, 4, 2, 2, 5, 1 is 2. A gap of 4 is twice that and continues a run; a gap of 5 is more
+    and ends it."""
     capture = record(tmp_path, moving_body((0, 2, 6, 8, 10, 15, 16)), RING, ("0",))
     assert runs(replace(capture, train_frames=capture.frames)) == [(0, 2, 6, 8, 10), (15, 16)]
 
 
-def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> None:
+def test_the_normal_equations_contain_the_gradient_of_the_cost(tmp_path: Path) -> None:
     """The gradient along a random direction through poses, shape and offsets agrees with central differences."""
     capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))
     rig, seen = two_bone_rig(), observe(capture)
@@ -248,4 +255,4 @@ def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> N
         above, below = (problem.assemble(end, data_term)[0] for end in ends)
         np.testing.assert_allclose(
             slope, (above - below) / 2e-6, rtol=5e-3
-        )  # the prior's axes, which turn with the shape, are held
+        )  # the prior's axes, which turn with the shape, are held fixed

@@ -7,7 +7,7 @@ from hnerf.body.fit_result import BodyFit
 from tests.body.two_bone import two_bone_rig
 
 
-def test_what_was_saved_is_loaded_and_keeps_the_contract(tmp_path: Path) -> None:
+def test_a_saved_fit_is_loaded_and_its_file_has_the_documented_arrays(tmp_path: Path) -> None:
     rig = two_bone_rig().to(dtype=torch.float32)
     theta = torch.zeros(2, 3, 3)
     theta[1, 1, 1] = torch.pi / 2
@@ -21,7 +21,7 @@ def test_what_was_saved_is_loaded_and_keeps_the_contract(tmp_path: Path) -> None
         assert set(stored) == {"theta", "T", "beta", "frames", "vertices", "faces", "joints", "joint_names"}
         np.testing.assert_allclose(
             stored["joints"][:, 2], [[5, 0, 2], [6, 0, 1]], atol=1e-6
-        )  # the tip, straight and bent
+        )  # the tip, with the elbow straight and bent
         np.testing.assert_allclose(stored["vertices"][1, 3], [6.5, 0, 1], atol=1e-6)
         assert stored["joint_names"].tolist() == ["root", "elbow", "tip"]
         np.testing.assert_allclose(stored["beta"], [0.3])

@@ -1,4 +1,4 @@
-"""SMPL poses given with a recording as the start of a fit: of a made-up SMPL model, and of anny."""
+"""SMPL poses given with a recording as the start of a fit, of a made-up SMPL model and of anny."""
 
 from pathlib import Path
 
@@ -31,8 +31,8 @@ def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def parameters() -> GivenPoses:
-    """Return three frames of somebody who stands, arms down, one forearm and one knee bent, upright in a world whose Z
-    is up; SMPL is Y up."""
+    """Return three frames of a person who stands upright with arms down, one forearm and one knee bent, in a world with
+    Z up; SMPL has Y up."""
     theta = np.zeros((3, 24, 3))
     theta[:, 16], theta[:, 17], theta[:, 18], theta[:, 5] = [0, 0, -1.2], [0, 0, 1.2], [0, -0.7, 0], [0.5, 0, 0]
     theta[:, 16, 2] += (0, 0.2, 0.4)
@@ -46,8 +46,8 @@ def joints_m(body: BodyFit | Pose) -> Tensor:
 
 
 def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture, BodyFit]:
-    """Record masks of the made-up person in the pose of `parameters()`, no keypoints, and other poses `given` for
-    it."""
+    """Record masks of the made-up person in the poses of `parameters()`, without keypoints but with the poses `given`,
+    which may differ."""
     pose = initial_pose_from_given(parameters(), body_model(FitSettings(body_model=model_file)))
     truth = BodyFit(pose.rig.to(dtype=torch.float32), (0, 1, 2), pose.theta.float(), pose.root.float())
     capture = record(folder, truth, RING, tuple(RING))
@@ -56,7 +56,7 @@ def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture
     return capture, truth
 
 
-def test_frames_without_a_pose_stand_as_their_nearest_neighbour(model_file: Path) -> None:
+def test_frames_without_a_given_pose_take_that_of_the_nearest_frame(model_file: Path) -> None:
     given = parameters()
     given.theta[0], given.root[0] = np.nan, np.nan
     pose = initial_pose_from_given(given, body_model(FitSettings(body_model=model_file)))
@@ -64,7 +64,7 @@ def test_frames_without_a_pose_stand_as_their_nearest_neighbour(model_file: Path
     assert not torch.equal(pose.theta[1], pose.theta[2])
 
 
-def test_contours_correct_given_poses_where_there_are_no_keypoints(model_file: Path, tmp_path: Path) -> None:
+def test_outlines_correct_given_poses_without_keypoints(model_file: Path, tmp_path: Path) -> None:
     """The given poses are 3 cm off, with arms 0.15 rad too high."""
     wrong = parameters()
     wrong.root[:, 0, 3] += 0.03
@@ -79,14 +79,14 @@ def test_contours_correct_given_poses_where_there_are_no_keypoints(model_file: P
     assert report["given_poses"] == "used as the start, and in place of keypoints, which are missing"
 
 
-def test_the_stages_before_a_fit_do_without_keypoints(model_file: Path, tmp_path: Path) -> None:
-    """Cameras are used as given and reported as unchecked; only the person is kept of the given masks."""
+def test_calibration_check_and_segmentation_work_without_keypoints(model_file: Path, tmp_path: Path) -> None:
+    """Cameras are used as given and reported as unchecked. Of the given masks, only the person is kept."""
     capture, truth = recorded(model_file, tmp_path, parameters())
     masks = silhouettes(capture, truth)
     for name in capture.train_cameras:
         for frame in capture.frames:
             given = np.where(masks.get(name, frame), 255, 0).astype(np.uint8)
-            given[:10, :10] = 255  # something else
+            given[:10, :10] = 255  # something other than the person
             write_image(tmp_path / "masks" / name / f"{frame:06d}.png", given)
     report = check_calibration(capture, CalibrationSettings())
     assert report.verdict == "ok" and report.cameras == capture.cameras
@@ -98,9 +98,9 @@ def test_the_stages_before_a_fit_do_without_keypoints(model_file: Path, tmp_path
     assert all(np.array_equal(found.get(c, f), masks.get(c, f)) for c in capture.train_cameras for f in capture.frames)
 
 
-def test_anny_takes_the_pose_by_corresponding_joints(model_file: Path) -> None:
-    """Limbs point within a few degrees the same way (the made-up T pose is a little off the mean one), from the same
-    hips."""
+def test_given_poses_are_transferred_to_anny_by_corresponding_joints(model_file: Path) -> None:
+    """Limbs start from the same hips and point in the same directions within a few degrees; the made-up T pose differs
+    a little from the mean one."""
     smpl, anny = (
         initial_pose_from_given(parameters(), body_model(FitSettings(body_model=m))) for m in (model_file, "anny")
     )
@@ -126,7 +126,7 @@ def test_anny_is_fitted_to_outlines_from_given_poses_alone(
     assert report["given_poses"].startswith("are SMPL's: used as the start, by corresponding joints")
 
 
-def test_frames_of_which_none_has_a_pose_have_no_given_poses(tmp_path: Path) -> None:
+def test_given_poses_that_are_all_unknown_count_as_none(tmp_path: Path) -> None:
     capture = record(tmp_path, moving_body((0, 1)), {"0": ring_camera("0", 0.0)}, ("0",))
     GivenPoses.unknown(2).save(tmp_path / "poses.npz")
     assert capture.given_poses() is None

@@ -33,8 +33,9 @@ def standing(height_m: float) -> Pose:
     return Pose(rig, theta, root, torch.zeros(25, 3, dtype=torch.float64))
 
 
-def test_who_stands_costs_nothing_and_two_centimetres_a_half() -> None:
-    """Less what fades: 0.5 / (1 + (2/25)^2); alike below the ground. One foot in the air costs nothing."""
+def test_standing_costs_nothing_and_two_centimetres_off_about_a_half() -> None:
+    """With the robust cost it is 0.5 / (1 + (2/25)^2), above and below the ground. One foot in the air costs
+    nothing."""
     assert cost_and_equations(standing(0.0))[0] < 1e-9
     for height_m in (0.02, -0.02):
         assert math.isclose(cost_and_equations(standing(height_m))[0], 0.5 / (1 + 0.0064), rel_tol=1e-4)
@@ -43,9 +44,9 @@ def test_who_stands_costs_nothing_and_two_centimetres_a_half() -> None:
     assert cost_and_equations(raised)[0] < 1e-9 and len(FEET) == 6
 
 
-def test_each_foot_that_is_down_stands_on_the_ground_and_one_that_swings_is_let_go() -> None:
-    """Four centimetres up, each foot costs 0.5 / (1 + (4/5)^2) beside the lower one's; a shank that is lifted by a
-    right angle costs no more than (5/4)^2 / 2."""
+def test_each_low_foot_is_pulled_to_the_ground_and_a_swinging_one_released() -> None:
+    """At a height of four centimetres, each foot costs 0.5 / (1 + (4/5)^2) in addition to the cost of the lower one. A
+    shank lifted by a right angle costs at most (5/4)^2 / 2."""
     lower = cost_and_equations(standing(0.04))[0]
     assert math.isclose(cost_and_equations(standing(0.04), EACH)[0], lower + 2 * 0.5 / 1.64, rel_tol=1e-3)
     for side in "LR":
@@ -54,24 +55,24 @@ def test_each_foot_that_is_down_stands_on_the_ground_and_one_that_swings_is_let_
         assert 0.7 < cost_and_equations(raised, EACH)[0] < 25 / 32
 
 
-def test_a_keypoint_that_is_seen_higher_up_stands_no_higher() -> None:
+def test_keypoint_offsets_do_not_change_the_height_above_ground() -> None:
     """A detector that sees toes and heels 4 cm above the model's does not lift the body."""
     pose = standing(0.0)
     pose.offsets_m[FEET, 2] = 0.04
     assert cost_and_equations(pose)[0] < 1e-9
 
 
-def test_the_gradient_of_the_ground_is_that_of_its_cost() -> None:
+def test_the_gradient_of_the_ground_term_matches_its_cost() -> None:
     pose = random_pose(anny_rig().to(dtype=torch.float64), 2)
     pose = replace(pose, offsets_m=torch.zeros(25, 3, dtype=torch.float64))
     for ground in (LOWER, EACH):
         check_gradient(pose, partial(cost_and_equations, ground=ground), rtol=1e-4, least=1e-2)
 
 
-def test_height_0_is_the_ground_where_who_stands_there_is_as_tall_as_people_are() -> None:
-    """Seen from a metre above the floor. If height 0 is 0.7 m below the floor, the ray to a foot meets it 1.7 times as
-    far away, and the person is 1.7 times as tall; 0.7 m above it, 0.3 times. Ankles tell it as well as soles; without
-    either, nothing does."""
+def test_height_0_is_the_ground_if_the_person_then_has_a_plausible_stature() -> None:
+    """The camera is one metre above the floor. If height 0 is 0.7 m below the floor, the ray to a foot reaches it 1.7
+    times as far away, so the person would be 1.7 times as tall; 0.7 m above it, 0.3 times. Ankles suffice instead of
+    soles; without either, the answer is no."""
     body, camera = moving_body((0,)), ring_camera("0", 0.0)
     keypoints_m = torch.einsum("kv,nvd->nkd", body.rig.keypoint_weights, body.vertices_m()).double().numpy()
     keypoints = np.concatenate([camera.project(keypoints_m)[0], np.ones((1, 25, 1))], -1)
@@ -84,8 +85,8 @@ def test_height_0_is_the_ground_where_who_stands_there_is_as_tall_as_people_are(
     assert not is_ground(camera, keypoints, "z", 1.2)
 
 
-def test_the_ground_shapes_the_body_too() -> None:
-    """Two centimetres up, the residual of .02 m has a weight of (.02 m x 1.0064)^-2."""
+def test_the_ground_term_acts_on_the_shape_too() -> None:
+    """At a height of two centimetres, the residual of .02 m has a weight of (.02 m x 1.0064)^-2."""
     pose, articulation = standing(0.02), Articulation(anny_rig().to(dtype=torch.float64))
     x, by_frame, by_shape = articulation.jacobian(articulation.keypoints(), articulation.pose(pose))
     by_shape = torch.zeros_like(by_shape)

@@ -33,7 +33,7 @@ def views_of(x: torch.Tensor) -> Views:
     return Views(CAMERAS, pixels, torch.ones(pixels.shape[:-1], dtype=torch.float64))
 
 
-def test_points_lie_at_the_joints_and_tips_beyond_them() -> None:
+def test_hand_points_lie_at_joints_and_fingertips() -> None:
     pose = body()
     articulation = Articulation(pose.rig)
     joints = articulation.pose(pose)
@@ -49,8 +49,8 @@ def test_points_lie_at_the_joints_and_tips_beyond_them() -> None:
     assert has_fingers(pose.rig) and not has_fingers(two_bone_rig())
 
 
-def test_the_points_of_a_palm_beside_its_image_count_as_one() -> None:
-    """12 points, each 29.4 mm = sqrt(6) x 12 mm beside in both cameras, one standard deviation: 12 x 2 x 0.5 / (1 +
+def test_the_points_of_a_palm_count_as_one_observation() -> None:
+    """12 points are each off by 29.4 mm = sqrt(6) x 12 mm in both cameras, one standard deviation: 12 x 2 x 0.5 / (1 +
     (29.4 / 60)^2 = 1.24). Fingers off by any distance cost nothing."""
     pose = body()
     articulation = Articulation(pose.rig)
@@ -63,14 +63,14 @@ def test_the_points_of_a_palm_beside_its_image_count_as_one() -> None:
     np.testing.assert_allclose(cost, 2 * 12 / 1.24)
 
 
-def test_a_hand_that_one_camera_sees_is_not_fitted() -> None:
-    """Of three cameras two see the left hand and one the right; in the next frame three and two."""
+def test_a_hand_must_be_seen_by_two_cameras() -> None:
+    """Of three cameras, two see the left hand and one the right; in the next frame, three and two do."""
     confidence = torch.tensor([[[0.9, 0.9], [0.9, 0.6]], [[0.6, 0.4], [0.7, 0.8]], [[0.1, 0.0], [0.6, 0.5]]])
     assert seen_twice(confidence).tolist() == [[True, False], [True, True]]
 
 
-def test_hands_are_observed_where_two_cameras_see_them() -> None:
-    """The left hand is in both cameras, the right one surely in the first only."""
+def test_observations_of_hands_seen_by_one_camera_are_dropped() -> None:
+    """Both cameras see the left hand; only the first one sees the right hand with confidence."""
     found = {"0": np.full((1, 2, 21, 3), 0.9), "1": np.full((1, 2, 21, 3), 0.6)}
     found["1"][0, 1, :, 2] = 0.4
     capture: Any = SimpleNamespace(
@@ -79,13 +79,14 @@ def test_hands_are_observed_where_two_cameras_see_them() -> None:
     views = observe_hands(capture)
     assert views is not None and views.cameras == CAMERAS
     assert views.confidence[:, 0, [0, 20, 21, 41]].tolist() == [[0.9, 0.9, 0, 0], [0.6, 0.6, 0, 0]]
-    for names in (("0",), ("0", "2")):  # a single camera, and one in which none were looked for
+    for names in (("0",), ("0", "2")):  # a single camera, and one without hand detection
         capture.train_cameras = names
         assert observe_hands(capture) is None
 
 
-def test_surer_points_count_more_when_a_palm_is_moved() -> None:
-    """Three of six points of the left palm are 9 px beside, half as sure as the others: (3 / 4 x 9) / (3 + 3 / 4)."""
+def test_moving_a_palm_weights_points_by_confidence() -> None:
+    """Three of six points of the left palm are off by 9 px, with half the confidence of the others: (3 / 4 x 9) / (3 +
+    3 / 4)."""
     x = points_of(body())
     seen = views_of(x)
     seen.pixels[0, :, [0, 1, 5], 0] -= 9
@@ -94,9 +95,9 @@ def test_surer_points_count_more_when_a_palm_is_moved() -> None:
     torch.testing.assert_close(moved[0, :, :21, 0], torch.full((2, 21), 1.8, dtype=torch.float64))
 
 
-def test_hand_points_move_onto_the_palm_of_the_body() -> None:
-    """The right hand is 5 px beside and 3 px below in the second camera; its knuckle, 12 px beside the others, takes
-    them 2 px along."""
+def test_hand_points_are_shifted_onto_the_bodys_palm() -> None:
+    """In the second camera, the right hand is off by 5 px sideways and 3 px down. One of its knuckles is off by 12 px
+    more, which shifts all points by 2 px."""
     x = points_of(body())
     seen = views_of(x)
     expected = seen.pixels.clone()
@@ -107,7 +108,7 @@ def test_hand_points_move_onto_the_palm_of_the_body() -> None:
     torch.testing.assert_close(moved_onto_palm(seen, x).pixels, expected)
 
 
-def test_the_gradient_of_the_palm_is_that_of_its_cost() -> None:
+def test_the_gradient_of_the_palm_term_matches_its_cost() -> None:
     pose = body()
     articulation, views = Articulation(pose.rig), views_of(points_of(pose))
     views.pixels.add_(9 * torch.randn(views.pixels.shape, generator=torch.Generator().manual_seed(3)))

@@ -20,7 +20,7 @@ def turned(x_m: float, about_z: float) -> np.ndarray:
 
 def test_kabsch_finds_a_quarter_turn() -> None:
     source = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
-    target = source @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]) + (7, 8, 9)  # x to y, y to -x
+    target = source @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]) + (7, 8, 9)  # takes x to y, y to -x
     expected = np.array([[0, -1, 0, 7], [1, 0, 0, 8], [0, 0, 1, 9], [0, 0, 0, 1.0]])
     np.testing.assert_allclose(kabsch(source, target), expected, atol=1e-12)
 
@@ -30,7 +30,7 @@ def test_kabsch_never_mirrors() -> None:
     assert np.linalg.det(kabsch(source, source * (1, 1, -1))[:3, :3]) > 0
 
 
-def test_shoulders_and_hips_place_the_body_in_space() -> None:
+def test_shoulders_and_hips_determine_the_root_in_space() -> None:
     rest, root = rest_keypoints(), turned(2.0, 1.3)
     points = rest @ root[:3, :3].T + root[:3, 3]
     points[4] = np.nan  # a wrist does not matter
@@ -43,7 +43,7 @@ def test_shoulders_and_hips_place_the_body_in_space() -> None:
     np.testing.assert_allclose(found, root, atol=1e-9)
 
 
-def test_three_points_or_a_line_do_not_place_the_body() -> None:
+def test_three_points_or_collinear_points_do_not_determine_the_root() -> None:
     rest = rest_keypoints()
     for known in ([2, 5, 9], [0, 1, 2, 8], [1, 2, 5, 8, 9]):
         points = np.full((25, 3), np.nan)
@@ -57,7 +57,7 @@ CAMERA = Camera("a", np.array([[500.0, 0, 255], [0, 500, 255], [0, 0, 1]]),
                 np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([0, 0, 3.0]), 512, 512)  # fmt: skip
 
 
-def test_one_image_places_the_body_facing_the_right_way() -> None:
+def test_one_image_determines_the_root_and_the_facing_direction() -> None:
     rest = rest_keypoints()
     for angle in (0.0, 1.5, 3.0, 4.5):
         root = turned(0.3, angle)
@@ -68,10 +68,10 @@ def test_one_image_places_the_body_facing_the_right_way() -> None:
     assert root_from_image(CAMERA, rest, np.zeros((25, 3))) is None
 
 
-def test_a_keypoint_that_the_others_contradict_does_not_place_the_body() -> None:
+def test_an_outlier_keypoint_does_not_change_the_root() -> None:
     rest, root = rest_keypoints(), turned(0.3, 1.5)
     pixels = CAMERA.project(rest @ root[:3, :3].T + root[:3, 3])[0]
-    pixels[2] += (150, -100)  # a shoulder that was found on somebody else
+    pixels[2] += (150, -100)  # a shoulder that was detected on another person
     found = root_from_image(CAMERA, rest, np.column_stack([pixels, np.ones(25)]))
     assert found is not None
     np.testing.assert_allclose(found, root, atol=1e-4)

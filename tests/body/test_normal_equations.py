@@ -4,11 +4,11 @@ from hnerf.body.normal_equations import NormalEquations
 
 
 def random_problem(frames: int, unknowns: int, shared: int) -> tuple[NormalEquations, np.ndarray, np.ndarray]:
-    """Return the banded form, the dense matrix and the dense gradient of the same random least squares."""
+    """Return the banded form, the dense matrix and the dense gradient of the same random least-squares problem."""
     generator = np.random.default_rng(0)
     size = frames * unknowns
     jacobian = np.zeros((frames * 40, size + shared))
-    for t in range(frames):  # each row touches three neighbouring frames at most
+    for t in range(frames):  # each row involves at most three neighbouring frames
         low, high = t * unknowns, min(t + 3, frames) * unknowns
         jacobian[t * 40 : (t + 1) * 40, low:high] = generator.normal(size=(40, high - low))
     jacobian[:, size:] = generator.normal(size=(len(jacobian), shared))
@@ -28,13 +28,13 @@ def free(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.full(count, -np.inf), np.full(count, np.inf)
 
 
-def test_the_banded_step_is_the_dense_one() -> None:
+def test_the_banded_step_matches_the_dense_solution() -> None:
     equations, dense, gradient = random_problem(6, 4, 3)
     frame, shared = equations.step(0.0, *free(3))
     np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(dense, gradient), atol=1e-10)
 
 
-def test_damping_adds_to_the_diagonal_what_does_not_couple_frames() -> None:
+def test_damping_scales_the_diagonal_without_the_coupling_between_frames() -> None:
     equations, dense, gradient = random_problem(4, 2, 2)
     equations.coupling_diagonal[:] = 5.0
     frame, shared = equations.step(0.5, *free(2))
@@ -43,13 +43,13 @@ def test_damping_adds_to_the_diagonal_what_does_not_couple_frames() -> None:
     np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(damped, gradient), atol=1e-10)
 
 
-def test_a_single_frame_needs_no_neighbours() -> None:
+def test_a_single_frame_is_solved_without_neighbours() -> None:
     equations, dense, gradient = random_problem(1, 4, 2)
     frame, shared = equations.step(0.0, *free(2))
     np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(dense, gradient), atol=1e-10)
 
 
-def test_a_shared_unknown_stops_at_its_bound_and_the_others_make_the_best_of_it() -> None:
+def test_a_shared_unknown_stops_at_its_bound_and_the_others_are_optimal() -> None:
     equations, dense, gradient = random_problem(4, 2, 2)
     wanted = -np.linalg.solve(dense, gradient)[-2]
     low, high = (np.array([wanted / 2, -np.inf]), np.array([np.inf, np.inf])) if wanted < 0 else (

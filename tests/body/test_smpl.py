@@ -1,4 +1,5 @@
-"""SMPL's file format as a rig, tested on a made-up person of tubes; vertices worked out by SMPL's own equations."""
+"""Read SMPL's file format as a rig, tested with a made-up person of tubes whose vertices follow from SMPL's own
+equations."""
 
 import pickle
 from pathlib import Path
@@ -27,7 +28,8 @@ def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def smpl_vertices(theta: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return SMPL (Loper et al. 2015, eqs. 2-6) without pose blend shapes: vertices (V, 3) and joints (24, 3), Y up."""
+    """Return vertices (V, 3) and joints (24, 3), Y up, by SMPL (Loper et al. 2015, eqs. 2-6) without pose blend
+    shapes."""
     data = made_up_smpl()
     shaped = data["v_template"] + data["shapedirs"] @ betas
     joints = data["J_regressor"] @ shaped
@@ -45,7 +47,7 @@ def smpl_vertices(theta: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def random_parameters(seed: int = 0) -> GivenPoses:
-    """Return random poses of two frames, without turns of toes and hands, which are locked."""
+    """Return random poses of two frames without rotations of toes and hands, which are locked."""
     random = np.random.default_rng(seed)
     theta = random.normal(0, 0.4, (2, 24, 3))
     theta[:, [10, 11, 22, 23]] = 0
@@ -54,8 +56,9 @@ def random_parameters(seed: int = 0) -> GivenPoses:
     return GivenPoses(theta, root, random.normal(0, 1, 10))
 
 
-def test_the_rig_stands_as_anny_does(model_file: Path) -> None:
-    """Z is up, facing -Y, left at +X, arms down and elbows bent forwards; weights and regressors sum to 1."""
+def test_the_smpl_rig_has_annys_axes_and_rest_pose(model_file: Path) -> None:
+    """Z is up, the body faces -Y with its left at +X, arms hang down and elbows are bent forwards. Weights and
+    regressors sum to 1."""
     rig = read_smpl(model_file).rig
     points = (rig.keypoint_weights @ rig.vertices_m).numpy()
     nose, left_wrist, left_elbow, left_shoulder, left_toe, left_heel = (points[k] for k in (0, 7, 6, 5, 19, 21))
@@ -67,8 +70,8 @@ def test_the_rig_stands_as_anny_does(model_file: Path) -> None:
     assert int(rig.free.sum()) == 19 and rig.joint_names[LEFT_ELBOW] == "lowerarm01.L" and rig.parents[0] == -1
 
 
-def test_given_parameters_put_joints_where_smpl_has_them(model_file: Path) -> None:
-    """Joints agree exactly, and so do vertices of a single joint, less the rest pose's blend shape."""
+def test_given_smpl_parameters_reproduce_smpls_joints_and_vertices(model_file: Path) -> None:
+    """Joints agree exactly, and so do vertices that follow a single joint and that no pose blend shape moves."""
     model, given = body_model(FitSettings(body_model=model_file)), random_parameters()
     pose = initial_pose_from_given(given, model)
     joints = joint_transforms(pose.rig, pose.theta, pose.root)[..., :3, 3].numpy()
@@ -83,31 +86,31 @@ def test_given_parameters_put_joints_where_smpl_has_them(model_file: Path) -> No
         assert np.allclose(vertices[t][rigid], (expected @ R.T + move)[rigid], atol=1e-9)
 
 
-def test_the_rest_pose_has_its_pose_blend_shape(model_file: Path) -> None:
-    """The made-up blend shape lifts the forearm by 0.1 (R - 1)[0, 0], R the elbow's turn from T to rest in SMPL's axes,
-    compared to a model without it."""
+def test_the_rest_pose_includes_its_pose_blend_shapes(model_file: Path) -> None:
+    """Compared with a model without it, the made-up blend shape lifts the forearm by 0.1 (R - 1)[0, 0], where R is the
+    elbow's rotation from the T pose to the rest pose in SMPL's axes."""
     smpl = read_smpl(model_file)
     data = made_up_smpl()
     plain_file = model_file.with_name("plain.npz")
     np.savez(plain_file, **data | {"posedirs": 0 * data["posedirs"]})
     lifted = (smpl.rig.vertices_m - read_smpl(plain_file).rig.vertices_m).norm(dim=1)
     shoulder, elbow = (smpl.rest_rotations[j] for j in (16, 18))
-    expected = 0.1 * abs(float((shoulder.T @ elbow)[0, 0]) - 1)  # the x axis is common to both frames
+    expected = 0.1 * abs(float((shoulder.T @ elbow)[0, 0]) - 1)  # both frames share the x axis
     assert expected > 0.01
     forearm = data["posedirs"].any((1, 2)) & (data["weights"].max(1) == 1)
     torch.testing.assert_close(lifted[forearm], torch.full((int(forearm.sum()),), expected, dtype=torch.float64))
     assert not lifted[~data["posedirs"].any((1, 2))].any()
 
 
-def test_pickled_and_plain_files_are_one_model(model_file: Path, tmp_path: Path) -> None:
+def test_pickled_and_plain_files_give_the_same_model(model_file: Path, tmp_path: Path) -> None:
     pickled, plain = read_smpl(write_smpl(tmp_path / "m.pkl")).rig, read_smpl(model_file).rig
     torch.testing.assert_close(pickled.vertices_m, plain.vertices_m)
     torch.testing.assert_close(pickled.shape_basis, plain.shape_basis)
 
 
-def test_smplx_loses_its_eyeballs(tmp_path: Path) -> None:
-    """Each eye has a tube of 190 vertices, whose first ring, of 27, is half the head's and stays; the eyes' keypoints
-    move to skin nearby."""
+def test_smplx_eyeballs_are_removed(tmp_path: Path) -> None:
+    """Each eye is a tube of 190 vertices. Its first ring, of 27, has half of its weight on the head and is kept. The
+    eyes' keypoints move to nearby skin."""
     rig = read_smpl(write_smpl(tmp_path / "x.npz", "smplx")).rig
     assert len(rig.vertices_m) == 10475 - 2 * (190 - 27)
     assert int(rig.free.sum()) == 19 and len(rig.joint_names) == 55
@@ -162,14 +165,14 @@ def _rewrite(path: Path, **changed: np.ndarray | None) -> None:
     np.savez(path, **{key: value for key, value in data.items() if value is not None})
 
 
-def test_endless_numbers_of_a_pickle_are_refused(tmp_path: Path) -> None:
+def test_huge_integers_in_a_pickle_are_refused(tmp_path: Path) -> None:
     (tmp_path / "m.pkl").write_bytes(pickle.dumps(made_up_smpl() | {"f": [[10**600, 1, 2]]}, 2))
     with pytest.raises(InputError, match=r"m\.pkl: holds other data"):
         read_smpl(tmp_path / "m.pkl")
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_no_model_is_refused(case: str, tmp_path: Path) -> None:
+def test_invalid_model_files_are_refused(case: str, tmp_path: Path) -> None:
     damage, names = BAD[case]
     path = tmp_path / "m.npz"
     path.write_bytes(b"")

@@ -6,10 +6,11 @@ from hnerf.body.rig import Rig
 
 
 def two_bone_rig() -> Rig:
-    """Joints at z = 0 (root), 1 (elbow, free) and 2 (tip, locked).
+    """Return the rig with joints at z = 0 (root), 1 (elbow, free) and 2 (tip, locked).
 
-    Vertices: v0 on the root, v1 half on root and half on the elbow, v2 on the elbow, v3 and v4 on the tip. beta
-    lengthens the upper bone: everything from v2 on moves up."""
+    Vertices: v0 follows the root, v1 root and elbow by half each, v2 the elbow, v3 and v4 the tip. beta lengthens the
+    upper bone: everything from v2 on moves up.
+    """
     vertices = torch.tensor([[0.1, 0, 0.5], [0.1, 0, 1.0], [0.0, 0, 1.5], [0.0, 0, 2.5], [0.1, 0, 2.5]])
     shape = torch.zeros(1, 5, 3)
     shape[0, 2:, 2] = 1.0
