@@ -1,4 +1,4 @@
-"""A detection whose networks never answer, for tests: python -m tests.detection.orphans FOLDER."""
+"""A detection whose networks never return, for tests: python -m tests.detection.orphans FOLDER."""
 
 import os
 import signal
@@ -12,13 +12,13 @@ from hnerf.detection import detect
 
 
 def never(capture: Any, camera: str, size: str, out: Path) -> None:
-    """Leave a file named after the process's id, and sleep."""
+    """Create a file named after the process id, then sleep."""
     (out / str(os.getpid())).touch()
     time.sleep(100)
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells let what they start in the background ignore it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background processes of a shell ignore SIGINT
     detect.find_in_camera = never
     cameras: Any = SimpleNamespace(train_cameras=("01", "02"), frames=(0,))
     detect._find_people(cameras, "lite", Path(sys.argv[1]))

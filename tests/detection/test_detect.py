@@ -1,4 +1,4 @@
-"""A capture without keypoints becomes one with; on the shared capture where the networks are there."""
+"""Detection adds keypoints to a capture without any; tested on the shared capture too if the networks are installed."""
 
 import os
 import shutil
@@ -30,7 +30,8 @@ LIMBS = [2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14]
 
 
 class MadeUp:
-    """A network that sees one person, all of him at (5, 4) but his right toe (32), which is beyond the image."""
+    """A network that sees one person with all points at (5, 4), except the right toe (32), which is outside the
+    image."""
 
     seen = 0
 
@@ -48,7 +49,8 @@ class MadeUp:
 
 @pytest.fixture
 def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Capture:
-    """Of one training camera, 24 x 16 px, five frames, with keypoints of its own of confidence .5; networks made up."""
+    """Return a capture with one training camera, 24 x 16 px, five frames and its own keypoints of confidence .5;
+    replace the networks by made-up ones."""
     for name in ("PersonDetector", "LandmarkNetwork"):
         monkeypatch.setattr(module, name, MadeUp)
     monkeypatch.setattr(module, "model_file", lambda name: None)
@@ -59,13 +61,13 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Capture:
     return ingest(folder, CaptureSettings(), tmp_path / "capture")
 
 
-def test_keypoints_come_from_the_network_and_all_else_from_the_recording(recording: Capture, tmp_path: Path) -> None:
+def test_keypoints_come_from_the_network_and_the_rest_from_the_recording(recording: Capture, tmp_path: Path) -> None:
     report = detect(recording, NETWORK, tmp_path / "out")
     found = Capture.load(tmp_path / "out")
     keypoints = found.keypoints("01")
     assert keypoints is not None and keypoints.shape == (5, 1, 25, 3)
     assert keypoints[:, 0, 1].tolist() == [[5, 4, 0.5]] * 5
-    assert keypoints[:, 0, [22, 20]].max() == 0  # beyond the image; no small toe
+    assert keypoints[:, 0, [22, 20]].max() == 0  # outside the image; the network has no small toe
     assert found.keypoints("02") is None
     assert np.array_equal(found.image("02", 3), recording.image("02", 3))
     assert report["cameras"]["01"]["seen"] == 5
@@ -73,20 +75,20 @@ def test_keypoints_come_from_the_network_and_all_else_from_the_recording(recordi
     assert mask.shape == (16, 24) and mask[4, 5] == 255 and mask[15, 23] == 0
 
 
-def test_what_a_recording_has_stays_where_both_are_asked_for(recording: Capture, tmp_path: Path) -> None:
+def test_with_source_both_the_recordings_own_keypoints_are_kept(recording: Capture, tmp_path: Path) -> None:
     detect(recording, BOTH, tmp_path / "out")
     kept, own = Capture.load(tmp_path / "out").keypoints("01"), recording.keypoints("01")
     assert kept is not None and own is not None and np.array_equal(kept, own)
 
 
-def test_cameras_that_are_done_are_not_looked_at_again(recording: Capture, tmp_path: Path) -> None:
+def test_cameras_that_are_done_are_not_processed_again(recording: Capture, tmp_path: Path) -> None:
     detect(recording, NETWORK, tmp_path / "out")
     detect(recording, NETWORK, tmp_path / "out")
     assert MadeUp.seen == 5
 
 
 @pytest.mark.parametrize("damage", [lambda whole: b"", lambda whole: whole[:60] + whole[61:]])
-def test_a_camera_whose_landmarks_were_cut_is_looked_at_again(
+def test_a_camera_with_damaged_landmarks_is_processed_again(
     recording: Capture, tmp_path: Path, damage: Callable[[bytes], bytes]
 ) -> None:
     detect(recording, NETWORK, tmp_path / "out")
@@ -97,7 +99,7 @@ def test_a_camera_whose_landmarks_were_cut_is_looked_at_again(
     assert MadeUp.seen == 10 and landmarks.read_bytes() == whole
 
 
-def test_people_found_again_are_the_same_files_however_long_it_took(recording: Capture, tmp_path: Path) -> None:
+def test_detection_is_reproducible_and_its_files_contain_no_timings(recording: Capture, tmp_path: Path) -> None:
     first, second = (detect(recording, NETWORK, tmp_path / name) for name in "ab")
     assert first["ms"].keys() == {"01"} and first["ms"] != second["ms"]
     one, other = (
@@ -107,7 +109,9 @@ def test_people_found_again_are_the_same_files_however_long_it_took(recording: C
     assert "detection.json" in one and "landmarks/01.npz" in one and one == other
 
 
-def test_nobody_is_one_line(recording: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_finding_nobody_is_a_one_line_error(
+    recording: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "LandmarkNetwork", lambda size: lambda image, region: None)
     with pytest.raises(InputError, match="folder: nobody found in any image of the training cameras; "):
         detect(recording, NETWORK, tmp_path / "out")
@@ -122,15 +126,16 @@ def test_a_network_that_finds_nobody_leaves_the_recordings_own_keypoints(
     assert kept is not None and own is not None and np.array_equal(kept, own)
 
 
-def test_missing_networks_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_networks_are_a_one_line_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "none"))
     capture = ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
     with pytest.raises(InputError, match=r"pose_detection\.tflite: not there; run `hnerf models`"):
         detect(capture, NETWORK, tmp_path / "out")
 
 
-def test_joints_are_where_the_truth_has_them(tmp_path: Path) -> None:
-    """A frame of two cameras, each in a process of its own: limb joints within 8 px, of a person of 333 px."""
+def test_detected_joints_are_close_to_the_ground_truth(tmp_path: Path) -> None:
+    """One frame of two cameras, each processed by its own worker. The median error of limb joints is below 8 px, for a
+    person 333 px tall."""
     if not all(has_model(name) for name in SHA256):
         pytest.skip("the networks are not in the cache: `hnerf models` fetches them")
     source, folder = shared_capture("valid-walk"), tmp_path / "folder"
@@ -151,8 +156,8 @@ def test_joints_are_where_the_truth_has_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_no_process_outlives_the_stage_that_was_ended(how: signal.Signals, tmp_path: Path) -> None:
-    """Nor does the stage wait for what its workers are at."""
+def test_no_worker_outlives_a_stage_that_is_killed_or_interrupted(how: signal.Signals, tmp_path: Path) -> None:
+    """The stage does not wait for its workers to finish either."""
     command = [sys.executable, "-m", "tests.detection.orphans", str(tmp_path)]
     stage = subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60

@@ -1,4 +1,4 @@
-"""Where hands are looked for, and which points are kept; numbers by hand."""
+"""Where hands are searched for, and which points are kept; numbers worked out by hand."""
 
 import math
 import threading
@@ -20,7 +20,7 @@ IMAGE = np.zeros((400, 400, 3), np.uint8)
 
 
 def flat_hand(wrist: tuple[float, float], confidence: float = 0.9) -> np.ndarray:
-    """Return a hand with fingers up, 40 px from wrist to knuckles, which are 30 px wide; palm points 50 px high."""
+    """Return a hand with fingers up: 40 px from wrist to knuckles, which span 30 px. Palm points reach 50 px high."""
     points = np.tile([*wrist, confidence], (21, 1))
     for finger, x in zip((1, 5, 9, 13, 17), (-15, -15, 0, 15, 15), strict=True):
         for segment in range(4):
@@ -29,7 +29,7 @@ def flat_hand(wrist: tuple[float, float], confidence: float = 0.9) -> np.ndarray
 
 
 def person(left_wrist: tuple[float, float], right_wrist: tuple[float, float]) -> np.ndarray:
-    """Return keypoints of somebody with nose and ankle 300 px apart and elbows 40 px above the wrists."""
+    """Return keypoints of a person with nose and ankle 300 px apart and elbows 40 px above the wrists."""
     keypoints = np.zeros((25, 3))
     keypoints[[0, 11]] = (200, 50, 1), (200, 350, 1)
     for (x, y), elbow, wrist in ((left_wrist, 6, 7), (right_wrist, 3, 4)):
@@ -37,9 +37,10 @@ def person(left_wrist: tuple[float, float], right_wrist: tuple[float, float]) ->
     return keypoints
 
 
-def test_a_hand_is_looked_for_beyond_the_forearm() -> None:
-    """A forearm 40 px to the right: the middle is 18 px farther, fingers point right; the side is 48 px. One of 10 px
-    of a person of 300 px counts as 30 px long for the side, 36 px."""
+def test_a_hand_is_searched_for_beyond_the_forearm() -> None:
+    """For a forearm of 40 px pointing right, the region's centre is 18 px beyond the wrist, its side is 48 px and
+    fingers point right. A forearm of 10 px, of a person of 300 px, counts as 30 px long for the side, which gives 36
+    px."""
     region = forearm_region(np.array([100.0, 100]), np.array([140.0, 100]), 300.0)
     assert region.centre_px == pytest.approx([158, 100])
     assert region.side_px == pytest.approx(48) and region.angle == pytest.approx(math.pi / 2)
@@ -47,8 +48,8 @@ def test_a_hand_is_looked_for_beyond_the_forearm() -> None:
 
 
 def test_the_next_region_is_around_the_palm() -> None:
-    """Wrist at (0, 0); palm points reach up to 50 px, those of the thumb to 60; so the palm is 60 px high, 30 wide, its
-    middle at (0, -30); the region is twice as large and 6 px farther up."""
+    """The wrist is at (0, 0). Palm points reach up to 50 px, those of the thumb to 60, so the palm is 60 px high and 30
+    px wide with its centre at (0, -30). The region is twice as large and shifted by 6 px upwards."""
     region = hand_region(flat_hand((0, 0))[:, :2])
     assert region.side_px == pytest.approx(120) and region.angle == pytest.approx(0)
     assert region.centre_px == pytest.approx([0, -36])
@@ -56,8 +57,8 @@ def test_the_next_region_is_around_the_palm() -> None:
     assert abs(upside_down.angle) == pytest.approx(math.pi) and upside_down.centre_px == pytest.approx([0, 36])
 
 
-def test_points_are_carried_from_the_crop_into_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A region of 448 px, 2 px a crop's pixel: (112, 112) is its middle, (0, 0) its corner."""
+def test_points_are_mapped_from_the_crop_to_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a region of 448 px, a crop pixel is 2 px: (112, 112) is its centre, (0, 0) its corner."""
     raw = np.full((21, 3), 112.0)
     raw[4] = 0, 0, 5
     monkeypatch.setattr(hands, "Network", lambda name: lambda image: [raw.ravel(), np.array([0.7])])
@@ -65,8 +66,9 @@ def test_points_are_carried_from_the_crop_into_the_image(monkeypatch: pytest.Mon
     assert points[0] == pytest.approx([300, 400, 0.7]) and points[4] == pytest.approx([76, 176, 0.7])
 
 
-def test_hands_are_kept_by_their_forearms() -> None:
-    """Left first. A hand far from its wrist is dropped, and one whose forearm is not seen is not looked for."""
+def test_hands_are_kept_only_near_a_visible_forearm() -> None:
+    """The left hand comes first. A hand far from its wrist is dropped, and a hand whose forearm is not visible is not
+    searched for."""
     keypoints = person((100, 200), (300, 200))
     found = find_hands(IMAGE, keypoints, lambda _, region: flat_hand((float(region.centre_px[0]), 205)))  # type: ignore[arg-type]
     assert found[:, 0, 0] == pytest.approx([100, 300], abs=8) and (found[..., 2] == 0.9).all()
@@ -77,12 +79,12 @@ def test_hands_are_kept_by_their_forearms() -> None:
     assert not found.any()
 
 
-def test_one_hand_found_twice_is_the_nearer_arms() -> None:
+def test_a_hand_found_for_both_arms_belongs_to_the_nearer_one() -> None:
     found = find_hands(IMAGE, person((190, 200), (210, 200)), lambda _, region: flat_hand((205, 205)))  # type: ignore[arg-type]
     assert not found[0].any() and found[1, 0, 2] == 0.9
 
 
-def test_each_thread_has_a_network_of_its_own_and_hands_lie_in_order_with_the_capture(
+def test_each_thread_has_its_own_network_and_hands_keep_the_order_of_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Points and confidences are the numbers of the images, from 0 to 9; a hand counts as found above .5."""

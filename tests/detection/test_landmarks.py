@@ -1,4 +1,5 @@
-"""From a landmark network's outputs to keypoints in the image and metres along the camera's axes; numbers by hand."""
+"""From a landmark network's outputs to keypoints in the image and metres along the camera's axes; numbers worked out by
+hand."""
 
 import math
 
@@ -9,13 +10,14 @@ from hnerf.detection import landmarks
 from hnerf.detection.landmarks import LandmarkNetwork, refine_by_heatmap
 from hnerf.detection.region import Region
 
-SURE = 60.0  # a logit
+SURE = 60.0  # a logit of practically 1
 
 
 def answers(presence: float = 0.9) -> list[np.ndarray]:
-    """Every point in the middle of the crop but the right wrist (16) at (64, 192); hips' middle (33) at (128, 160), the
-    circle's top (34) at (128, 96). The wrist is 0.3 m to the right, 0.2 m up, and visible
-    by .5; the left one (15) is in the image by .5; no heat."""
+    """Return network outputs with every point at the centre of the crop, except the right wrist (16) at (64, 192), the
+    middle of the hips (33) at (128, 160) and the top of the circle (34) at (128, 96). The right wrist is 0.3 m to the
+    right and 0.2 m up, with visibility .5. The left wrist (15) is inside the image with probability .5. Heatmaps are
+    empty."""
     points = np.tile([128.0, 128, 0, SURE, SURE], (39, 1))
     points[16] = 64, 192, 0, 0, SURE
     points[15, 4] = 0
@@ -32,8 +34,8 @@ def network(monkeypatch: pytest.MonkeyPatch) -> LandmarkNetwork:
     return LandmarkNetwork("heavy")
 
 
-def test_points_are_carried_from_the_crop_into_the_image(network: LandmarkNetwork) -> None:
-    """A region of 512 px around (300, 400), so 2 px a crop's pixel: the wrist is 64 crop pixels left of the middle and
+def test_points_are_mapped_from_the_crop_to_the_image(network: LandmarkNetwork) -> None:
+    """In a region of 512 px around (300, 400), a crop pixel is 2 px. The wrist is 64 crop pixels left of the centre and
     64 below it, at (172, 528). The next region is around (300, 464), 2.5 x 128 px wide."""
     person = network(np.zeros((800, 600, 3), np.uint8), Region(np.array([300.0, 400.0]), 512.0, 0.0))
     assert person is not None
@@ -48,8 +50,8 @@ def test_points_are_carried_from_the_crop_into_the_image(network: LandmarkNetwor
 
 
 def test_a_turned_region_turns_points_and_metres(network: LandmarkNetwork) -> None:
-    """By 90 degrees clockwise left becomes up and down left: 128 px up and 128 px left of the middle; (0.3, -0.2)
-    becomes (0.2, 0.3)."""
+    """A turn by 90 degrees clockwise takes left to up and down to left: 128 px up and 128 px left of the centre. (0.3,
+    -0.2) becomes (0.2, 0.3)."""
     person = network(np.zeros((800, 600, 3), np.uint8), Region(np.array([300.0, 400.0]), 512.0, math.pi / 2))
     assert person is not None
     assert person.points_px[16, :2] == pytest.approx([172, 272])
@@ -57,15 +59,15 @@ def test_a_turned_region_turns_points_and_metres(network: LandmarkNetwork) -> No
     assert person.next.angle == pytest.approx(math.pi / 2)
 
 
-def test_nobody_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_low_presence_means_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(landmarks, "Network", lambda name: lambda image: answers(presence=0.4))
     assert LandmarkNetwork("lite")(np.zeros((8, 8, 3), np.uint8), Region(np.zeros(2), 8.0, 0.0)) is None
 
 
-def test_points_move_to_the_mean_of_the_heat_around_them() -> None:
-    """A cell is 4 px. Heat of .6 at (12, 10) and .2 at (12, 14) in the window of (12, 11): the mean is (12, 11), at
-    (48, 44) px. Heat below .5 moves nothing, nor does heat beyond three cells, nor any outside of the crop; at
-    three cells, (15, 11), it does."""
+def test_points_are_refined_to_the_mean_of_the_nearby_heatmap() -> None:
+    """A heatmap cell is 4 px. Values of .6 at (12, 10) and .2 at (12, 14), in the window around (12, 11), have their
+    mean at (12, 11), which is (48, 44) px. A point is not moved by values below .5, nor by values more than three cells
+    away, nor if it is outside the crop. A value exactly three cells away, at (15, 11), moves it."""
     heat = np.zeros((64, 64, 5))
     heat[10, 12, 0], heat[14, 12, 0], heat[10, 30, 0] = 0.6, 0.2, 0.9
     heat[10, 12, 1] = 0.4

@@ -1,4 +1,4 @@
-"""What a recording's own keypoints lack comes from the network's, of the same person."""
+"""Keypoints that a recording lacks are filled in from the network's detection of the same person."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from hnerf.detection.merge import fill_missing, nearest_person, pad_people
 
 
 def person(x: float, confidence: float) -> np.ndarray:
-    """Points on a line of 100 px, from (x, 0) to (x, 100)."""
+    """Return points on a line of 100 px, from (x, 0) to (x, 100)."""
     return np.column_stack([np.full(25, x), np.linspace(0, 100, 25), np.full(25, confidence)])
 
 
-def test_missing_joints_come_from_the_same_person() -> None:
+def test_missing_joints_are_filled_from_the_same_person() -> None:
     own = person(0, 0.9)
     own[11] = 0
     merged = fill_missing(own[None], np.stack([person(40, 0.5), person(10, 0.6)]))
@@ -19,16 +19,17 @@ def test_missing_joints_come_from_the_same_person() -> None:
     assert merged[0, 10].tolist() == own[10].tolist()
 
 
-def test_people_farther_than_a_share_of_the_height_are_others() -> None:
-    """15 px of 100 are the limit."""
+def test_people_farther_than_a_fraction_of_the_height_are_others() -> None:
+    """The limit is 15 px for a height of 100 px."""
     own = person(0, 0.9)
     own[11] = 0
     assert fill_missing(own[None], person(16, 0.6)[None])[0, 11].tolist() == [0, 0, 0]
 
 
-def test_the_person_is_compared_where_both_are_seen() -> None:
-    """Of a subject 100 px tall, seen at three of five places, the second of three people is 10 px off at two, and far
-    off at places that either lacks; the first is 20 px off, the last not seen at all. 15 px off are another person."""
+def test_people_are_compared_at_keypoints_that_both_have() -> None:
+    """The subject is 100 px tall and has three of five keypoints. Of three people, the first is 20 px off. The second
+    is 10 px off at two keypoints, and far off at those that either of the two lacks. The third is not seen at all.
+    Beyond 15 px it is another person."""
     subject = np.array([[0, 0, 1], [0, 100, 1], [30, 50, 1], [0, 0, 0], [0, 0, 0.0]])
     people = np.stack([subject + np.array([20, 0, 0]), subject + np.array([10, 0, 0]), 0 * subject])
     people[1, 2] = 500, 500, 0
@@ -42,11 +43,11 @@ def test_the_person_is_compared_where_both_are_seen() -> None:
     assert nearest_person(subject, people[2:]) is None
 
 
-def test_where_the_recording_shows_nobody_the_network_speaks() -> None:
+def test_without_recorded_keypoints_the_networks_person_is_used() -> None:
     assert fill_missing(np.zeros((1, 25, 3)), person(7, 0.6)[None]).tolist() == person(7, 0.6)[None].tolist()
 
 
-def test_frames_have_as_many_rows_as_the_fullest() -> None:
+def test_all_frames_are_padded_to_the_largest_number_of_people() -> None:
     rows = pad_people([np.zeros((0, 25, 3)), np.ones((2, 25, 3))])
     assert rows.shape == (2, 2, 25, 3) and rows[0].max() == 0 and rows[1].min() == 1
     assert pad_people([np.zeros((0, 25, 3))]).shape == (1, 1, 25, 3)

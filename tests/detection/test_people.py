@@ -1,4 +1,4 @@
-"""What becomes of the subject and of others: masks, figures, and who cannot be used."""
+"""How the subject and other people are handled: masks, figures, and subjects that cannot be used."""
 
 import dataclasses
 from pathlib import Path
@@ -28,7 +28,7 @@ def track(*images: np.ndarray, moves: bool = True) -> PersonTrack:
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Capture:
-    """Of one camera, 100 x 100 px, two frames; grey images."""
+    """Return a capture of one camera with 100 x 100 px and two grey frames."""
     camera = dataclasses.replace(ring(1)[0], width_px=SIZE_PX, height_px=SIZE_PX)
     found = write_capture(tmp_path, [camera], {"c0": np.zeros((2, 1, 25, 3))})
     for frame in found.frames:
@@ -36,9 +36,9 @@ def capture(tmp_path: Path) -> Capture:
     return found
 
 
-def test_a_pixel_is_whose_it_is_likelier(capture: Capture, tmp_path: Path) -> None:
-    """Both masks cover the whole image, the other's with 200 of 255 on its right half, the subject's with 150; in the
-    second image the other is alone."""
+def test_a_pixel_belongs_to_the_person_with_the_higher_mask_value(capture: Capture, tmp_path: Path) -> None:
+    """Both masks cover the image. The other person's has 200 of 255 on its right half, the subject's has 150
+    everywhere. In the second image the other person is alone."""
     masks = np.zeros((2, 2, 256, 256), np.uint8)
     masks[:, 0, :, 128:], masks[:, 1] = 200, 150
     regions = np.tile([49.5, 49.5, 100.0, 0.0], (2, 2, 1))
@@ -53,13 +53,13 @@ def test_a_pixel_is_whose_it_is_likelier(capture: Capture, tmp_path: Path) -> No
     assert second.max() == 0
 
 
-def test_where_the_subject_is_alone_the_mask_stays(capture: Capture, tmp_path: Path) -> None:
+def test_the_mask_is_unchanged_if_the_subject_is_alone(capture: Capture, tmp_path: Path) -> None:
     people, found = np.stack([[standing(25)]] * 2), {"masks": np.zeros((2, 1, 256, 256)), "regions": np.ones((2, 1, 4))}
     keep_subject(tmp_path, capture, "c0", people[:, 0], people, found)
     assert not (tmp_path / "person").exists()
 
 
-def test_figures_say_who_was_taken(capture: Capture) -> None:
+def test_figures_list_the_subject_and_the_people_left_out(capture: Capture) -> None:
     rows = people_rows(
         capture, [track(standing(25), standing(30)), track(standing(75, 40), 0 * standing(0), moves=False)]
     )
@@ -69,8 +69,8 @@ def test_figures_say_who_was_taken(capture: Capture) -> None:
     ]
 
 
-def test_the_picture_shows_the_subject_green_and_others_red(capture: Capture, tmp_path: Path) -> None:
-    """It is 360 px high: the subject's line at 25 px of 100 is at 90, the other's at 270."""
+def test_the_overview_draws_the_subject_green_and_others_red(capture: Capture, tmp_path: Path) -> None:
+    """The overview is 360 px high: the subject's line at 25 of 100 px is drawn at 90 px, the other's at 270 px."""
     draw_people(
         tmp_path / "people.png", capture, [track(standing(25), standing(25)), track(standing(75), standing(75))]
     )
@@ -79,14 +79,14 @@ def test_the_picture_shows_the_subject_green_and_others_red(capture: Capture, tm
     assert picture[180, 90].tolist() == [0, 200, 0] and picture[180, 270].tolist() == [220, 0, 0]
 
 
-def test_who_is_too_small_is_one_line(capture: Capture) -> None:
+def test_a_person_who_is_too_small_is_refused(capture: Capture) -> None:
     check_subject(capture, track(standing(25, 80), standing(25, 80)))
     with pytest.raises(InputError, match="ring: the person is 79 px tall at most, and 80 are needed; record"):
         check_subject(capture, track(standing(25, 79), standing(25, 79)))
 
 
-def test_who_is_always_cut_off_is_one_line(capture: Capture) -> None:
-    """Of the ankles one is seen in the first image, the other in the second, but never both."""
+def test_a_person_who_is_always_cut_off_is_refused(capture: Capture) -> None:
+    """One ankle is seen in the first image and the other in the second, but never both."""
     left, right = standing(25), standing(25)
     left[11], right[14] = 0, 0
     with pytest.raises(InputError, match="ring: the person is always cut off by the images' border; record"):

@@ -1,4 +1,4 @@
-"""Anchors, boxes and who is one person; numbers by hand."""
+"""Anchors, boxes and non-maximum suppression of people; numbers worked out by hand."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import pytest
 from hnerf.detection.person_detector import anchors, decode_boxes, weighted_nms
 
 
-def test_anchors_are_the_middles_of_cells_layer_by_layer() -> None:
-    """28^2 x 2 + 14^2 x 2 + 7^2 x 6 = 2254; two in a cell of 1/28; row by row."""
+def test_anchors_are_cell_centres_layer_by_layer() -> None:
+    """28^2 x 2 + 14^2 x 2 + 7^2 x 6 = 2254 anchors, row by row; cells of 1/28 have two each."""
     at = anchors()
     assert at.shape == (2254, 2)
     assert at[0] == pytest.approx([0.5 / 28, 0.5 / 28]) and at[1] == pytest.approx(at[0])
@@ -18,8 +18,9 @@ def test_anchors_are_the_middles_of_cells_layer_by_layer() -> None:
     assert at[2253] == pytest.approx([6.5 / 7, 6.5 / 7])
 
 
-def test_boxes_and_points_are_told_from_anchors() -> None:
-    """22.4 px are a tenth: middle .5 + .1, .5 - .1, sides .2 and .4; first point .5 + .2, .5, last one the anchor's."""
+def test_boxes_and_points_are_decoded_relative_to_anchors() -> None:
+    """22.4 px are a tenth of the image. The centre is .5 + .1, .5 - .1 and the sides are .2 and .4. The first point is
+    .5 + .2, .5, and the last one the anchor itself."""
     raw = np.array([[22.4, -22.4, 44.8, 89.6, 44.8, 0, 0, 0, 0, 0, 0, 0]])
     box = decode_boxes(raw, np.array([[0.5, 0.5]]))[0]
     assert box[:2] == pytest.approx(np.array([[0.5, 0.2], [0.7, 0.6]]))
@@ -27,8 +28,9 @@ def test_boxes_and_points_are_told_from_anchors() -> None:
 
 
 def test_overlapping_boxes_are_averaged_by_score() -> None:
-    """Boxes of side 2 at x = 0 and 0.8: common 1.2 x 2, together 5.6, IoU .43. Scores .9 and .6: 0.8 x .6 / 1.5 = .32.
-    One at 1.2 has .25 with the first, and is another person."""
+    """Boxes of side 2 at x = 0 and 0.8 have an intersection of 1.2 x 2 and a union of 5.6, so an IoU of .43. With
+    scores .9 and .6, the mean is at 0.8 x .6 / 1.5 = .32. A box at 1.2 has an IoU of .25 with the first, and is another
+    person."""
 
     def person(x: float) -> np.ndarray:
         return np.array([[x, 0], [x + 2, 2], *[[x, 1]] * 4])

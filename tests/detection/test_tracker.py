@@ -1,4 +1,4 @@
-"""People are followed from image to image, and looked for anew where they are lost; with networks that are made up."""
+"""People are tracked from image to image and detected again when they are lost; with made-up networks."""
 
 import numpy as np
 import pytest
@@ -11,13 +11,14 @@ SIDE_PX = 100.0
 
 
 class Scene:
-    """Images hold the places of people, rows (x, y); a network sees whoever is within half a region's side."""
+    """A scene whose images are the positions of people, rows (x, y). The landmark network sees a person within half a
+    region's side."""
 
     def __init__(self) -> None:
-        self.looked, self.landmarked = 0, 0
+        self.detections, self.landmarked = 0, 0
 
     def detector(self, image: np.ndarray) -> list[Region]:
-        self.looked += 1
+        self.detections += 1
         return [Region(place + 5, SIDE_PX, 0.0) for place in image]
 
     def landmarks(self, image: np.ndarray, region: Region) -> Person | None:
@@ -33,29 +34,29 @@ def places(people: list[Person]) -> list[float]:
     return [person.points_px[0, 0] for person in people]
 
 
-def test_who_moves_little_is_followed_without_looking_again() -> None:
+def test_a_person_who_moves_little_is_tracked_without_new_detection() -> None:
     scene, images = Scene(), [np.array([[8.0 * i, 0.0]]) for i in range(REDETECT_EVERY)]
     assert [places(people) for people in track(images, scene.detector, scene.landmarks)] == [
         [8.0 * i] for i in range(10)
     ]
-    assert scene.looked == 1 and scene.landmarked == len(images)
+    assert scene.detections == 1 and scene.landmarked == len(images)
 
 
-def test_who_is_lost_is_looked_for() -> None:
+def test_a_lost_person_is_detected_again() -> None:
     scene, images = Scene(), [np.array([[0.0, 0.0]]), np.zeros((0, 2)), np.array([[500.0, 0.0]])]
     assert [places(people) for people in track(images, scene.detector, scene.landmarks)] == [[0.0], [], [500.0]]
-    assert scene.looked == 3
+    assert scene.detections == 3
 
 
-def test_who_moves_far_is_looked_at_twice() -> None:
-    """30 px of 100: the second pass, at the place that the first one found, agrees with itself."""
+def test_landmarks_are_found_twice_for_a_person_who_moves_far() -> None:
+    """The person moves by 30 px of 100. The second pass, at the place found by the first, agrees with it."""
     scene, images = Scene(), [np.array([[0.0, 0.0]]), np.array([[30.0, 0.0]])]
     *_, people = track(images, scene.detector, scene.landmarks)
     assert scene.landmarked == 1 + 2
     assert people[0].region.centre_px == pytest.approx([30, 0])
 
 
-def test_who_comes_later_is_found_once_and_nobody_twice() -> None:
+def test_a_person_who_enters_later_is_found_once_and_nobody_twice() -> None:
     scene, images = (
         Scene(),
         [np.array([[0.0, 0.0], [300.0, 0.0]][: 1 if i < 3 else 2]) for i in range(REDETECT_EVERY + 2)],
@@ -64,9 +65,9 @@ def test_who_comes_later_is_found_once_and_nobody_twice() -> None:
     assert counts == [1] * REDETECT_EVERY + [2, 2]
 
 
-def test_who_is_missing_is_looked_for_in_every_image() -> None:
+def test_detection_runs_in_every_image_while_a_person_is_missing() -> None:
     """Two people meet in the second image and part in the third: both are found again at once."""
     near, apart = np.array([[0.0, 0.0], [60.0, 0.0]]), np.array([[0.0, 0.0], [4.0, 0.0]])
     scene, images = Scene(), [near, apart, near]
     counts = [len(people) for people in track(images, scene.detector, scene.landmarks)]
-    assert counts == [2, 1, 2] and scene.looked == 3
+    assert counts == [2, 1, 2] and scene.detections == 3
