@@ -1,4 +1,4 @@
-"""A synthetic subject: a ball that a stand-in avatar shows in one colour, seen by cameras around it."""
+"""A synthetic subject: a ball that a stand-in avatar renders in one colour, seen by cameras around it."""
 
 import json
 from dataclasses import dataclass, replace
@@ -24,12 +24,12 @@ SIZE_PX = 64
 FRAMES = (0, 1, 2, 3)  # the last is the novel pose
 NOVEL = (3,)
 RENDERED, PHOTOGRAPHED = 102, 153  # grey levels, of 255
-TUNED_M = 0.02  # by which training raised the body of the novel frame: two pixels
+TUNED_M = 0.02  # training raised the body of the novel frame by this: two pixels
 
 
 @dataclass(frozen=True)
 class BallAvatar:
-    """The avatar of a grey ball with exact distances. What is learned for single frames darkens it."""
+    """The avatar of a grey ball with exact distances. Its learned per-frame changes make it darker."""
 
     body: BodyFit
     grey: float = RENDERED
@@ -62,7 +62,7 @@ def centre_m(frame: int) -> np.ndarray:
 
 
 def seen(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
-    """Return the pixels whose rays meet the ball, (H, W) bool."""
+    """Return the mask (H, W) bool of pixels whose rays hit the ball."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1)
     origins, directions = camera.rays(pixels.astype(np.float64))
     offset = np.cross(middle_m - origins, directions)
@@ -70,7 +70,7 @@ def seen(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
 
 
 def ball_camera(name: str, turn_deg: float) -> Camera:
-    """Return a camera 0.75 m off, at the ball's height, that looks at (0, 0, 1)."""
+    """Return a camera 0.75 m away, at the ball's height, that looks at (0, 0, 1)."""
     angle = np.deg2rad(turn_deg)
     forward = np.array([-np.cos(angle), -np.sin(angle), 0])
     down = np.array([0, 0, -1.0])
@@ -104,7 +104,8 @@ def ball_fit() -> BodyFit:
 
 
 def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -> Capture:
-    """Write a ball on grey photographed by "a", "b" and the test cameras, and `capture.toml` as recordings have it."""
+    """Write images of a ball on grey from cameras "a", "b" and the test cameras, and a `capture.toml` as in
+    recordings."""
     names = ("a", "b", *test_cameras)
     cameras = {n: ball_camera(n, 80.0 * k) for k, n in enumerate(names)}
     sizes = dict.fromkeys(names, (SIZE_PX, SIZE_PX))
@@ -121,7 +122,7 @@ def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -
 
 
 def write_ball_truth(capture: Capture, radius_m: float) -> None:
-    """Write `ground_truth/` with exact masks of every view, and a true surface of another radius for frame 0."""
+    """Write `ground_truth/` with exact masks of every view, and for frame 0 a true surface with another radius."""
     for camera in capture.cameras.values():
         for frame in FRAMES:
             mask = seen(camera, centre_m(frame)).astype(np.uint8) * 255
@@ -133,7 +134,7 @@ def write_ball_truth(capture: Capture, radius_m: float) -> None:
 
 
 def write_ball_masks(capture: Capture, camera: str) -> None:
-    """Write masks that came with a camera's recording, in which the left half of the ball is missing."""
+    """Write a camera's masks as if they came with its recording, without the left half of the ball."""
     for frame in FRAMES:
         mask = seen(capture.cameras[camera], centre_m(frame)).astype(np.uint8) * 255
         mask[:, : SIZE_PX // 2] = 0
@@ -148,7 +149,7 @@ def tuned(fit: BodyFit) -> BodyFit:
 
 
 def write_settings(training: Path, kind: str = "fast", nodes: int = 8, steps: int = 80) -> None:
-    """Write the parts of training's settings.json on which the columns of novel poses depend."""
+    """Write the parts of training's settings.json that decide which novel-pose columns exist."""
     fast = kind == "fast"
     settings: dict[str, Any] = {"pose_learning_rate": 5e-4 * fast, "novel_pose_steps": steps}
     settings |= {"field": {"kind": kind} | ({"nodes": nodes} if fast else {})}

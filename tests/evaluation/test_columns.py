@@ -8,9 +8,9 @@ from hnerf.evaluation.views import SPLITS
 from tests.evaluation.ball import BallAvatar, ball_fit, tuned, write_settings
 
 
-def test_animated_knows_neither_tuned_poses_nor_frames() -> None:
-    """Read from the field's grey whether it was queried for one of its frames, and from the ball's place which pose it
-    was given."""
+def test_the_animated_column_uses_neither_tuned_poses_nor_per_frame_changes() -> None:
+    """The grey level shows whether the field was queried for one of its frames, and the ball's position shows which
+    pose it was given."""
     fit = ball_fit()
     avatar = BallAvatar(tuned(fit), 100, frames_darken_by=51)
     k, fitted_m, tuned_m = fit.index(3), fit.root[3, 2, 3].item(), avatar.body.root[3, 2, 3].item()
@@ -26,7 +26,7 @@ def test_animated_knows_neither_tuned_poses_nor_frames() -> None:
         assert (shown.body.root[k, 2, 3].item(), shown.frames_darken_by) == (place_m, darker), split
 
 
-def test_animated_has_the_trained_shape() -> None:
+def test_the_animated_column_uses_the_trained_shape() -> None:
     fit = ball_fit()
     rig = replace(fit.rig, vertices_m=1.1 * fit.rig.vertices_m)
     assert avatar_for_split("novel_pose", BallAvatar(replace(fit, rig=rig)), fit).body.rig is rig
@@ -41,12 +41,12 @@ def test_animated_has_the_trained_shape() -> None:
         ("nerf", 0, ["novel_pose", "novel_pose_posed", "novel_pose_tracked"]),
     ],
 )
-def test_what_is_not_tuned_has_no_column(tmp_path: Path, kind: str, nodes: int, lacks: list[str]) -> None:
+def test_untuned_novel_pose_columns_are_unavailable(tmp_path: Path, kind: str, nodes: int, lacks: list[str]) -> None:
     write_settings(tmp_path, kind, nodes)
     assert [split for split in SPLITS if reason_unavailable(split, tmp_path)] == lacks
 
 
-def test_frames_that_were_not_tuned_have_no_column_of_their_own(tmp_path: Path) -> None:
+def test_without_tuning_steps_only_the_animated_column_exists(tmp_path: Path) -> None:
     write_settings(tmp_path, "fast", steps=0)
     assert [split for split in SPLITS if reason_unavailable(split, tmp_path)] == [
         "novel_pose_posed",

@@ -54,8 +54,8 @@ HOSTILE = "<script>alert(1)</script>"
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse_meshes() -> Iterator[None]:
-    """Extract surfaces on a grid that is coarse, but fine enough for figures worked out by hand; draw small pictures of
-    them, which nobody looks at here."""
+    """Extract surfaces on a coarse grid, fine enough for the values worked out by hand, and draw small images of them,
+    which no test looks at."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("hnerf.avatar.surface.POSED_CELLS", 96)
         patched.setattr("hnerf.evaluation.pictures.PICTURE_PX", (75, 100))
@@ -64,7 +64,7 @@ def coarse_meshes() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
-    """Evaluate a subject with ground truth and one test camera; its evaluation lies beside its capture."""
+    """Evaluate a subject with ground truth and one test camera; write the evaluation next to its capture."""
     base = tmp_path_factory.mktemp("scored")
     capture = write_ball_capture(base / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M + GAP_M)
@@ -84,12 +84,12 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
 
 @pytest.fixture(scope="module")
 def unscored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
-    """Evaluate a subject without ground truth and without test cameras, whose name is markup."""
+    """Evaluate a subject without ground truth or test cameras, whose name contains markup."""
     base = tmp_path_factory.mktemp("unscored")
     return evaluated(base, ball_inputs(write_ball_capture(base / "capture", HOSTILE, ()), base / "stages"))
 
 
-def test_image_figures_by_hand(scored: Scored) -> None:
+def test_image_scores_by_hand(scored: Scored) -> None:
     base, found = scored
     psnr = []
     for frame in (0, 1, 2):
@@ -112,8 +112,8 @@ def test_the_report_may_show_more_images_than_are_scored(tmp_path: Path) -> None
     assert found["novel_view"]["n"] == 1 and (out / "report.html").is_file()
 
 
-def test_few_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> None:
-    """Of frames 0 to 2 expect 1, the only one with a mask, not the first and the last."""
+def test_scored_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> None:
+    """Of frames 0 to 2, only frame 1 has a mask, so it is chosen instead of the first and the last."""
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
@@ -123,7 +123,7 @@ def test_few_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> N
     assert [row["frame"] for row in found["novel_view"]["per_image"]] == [1]
 
 
-def test_geometry_figures_by_hand(scored: Scored) -> None:
+def test_geometry_scores_by_hand(scored: Scored) -> None:
     geometry = scored[1]["novel_view"]["geometry"]
     assert geometry["chamfer_mm"] == pytest.approx(1e3 * GAP_M, rel=0.01)
     assert geometry["chamfer_l2_e3"] == pytest.approx(1e3 * GAP_M**2, rel=0.02)
@@ -134,7 +134,7 @@ def test_geometry_figures_by_hand(scored: Scored) -> None:
     assert scored[1]["novel_pose"]["geometry"] is None  # no true surface in its frame
 
 
-def test_renderings_and_meshes_lie_where_the_contract_says(scored: Scored) -> None:
+def test_renderings_and_meshes_have_the_documented_paths(scored: Scored) -> None:
     out = scored[0] / "subject" / "evaluation"
     written = {str(p.relative_to(out)) for p in out.rglob("*") if p.suffix in (".png", ".ply") and p.parent != out}
     assert {p for p in written if "training_view" not in p} == {
@@ -149,7 +149,7 @@ def test_renderings_and_meshes_lie_where_the_contract_says(scored: Scored) -> No
     assert np.array_equal(image[..., 3], seen(TEST_CAMERA, centre_m(1)) * 255)
 
 
-def test_figures_agree_with_the_independent_program(scored: Scored) -> None:
+def test_scores_agree_with_the_independent_scoring_program(scored: Scored) -> None:
     if not SCORE_RUN.exists():
         pytest.skip("the independent scoring program is not beside this checkout")
     (base, found), program = scored, runpy.run_path(str(SCORE_RUN))
@@ -167,7 +167,7 @@ def test_figures_agree_with_the_independent_program(scored: Scored) -> None:
 
 
 def test_a_rendering_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    """Put a folder where a rendering should go."""
+    """A folder exists at the path of a rendering."""
     view = View("novel_view", "c", 1)
     view.path(tmp_path).mkdir(parents=True)
     with pytest.raises(OSError, match=r"000001\.png: cannot be written"):
@@ -179,7 +179,7 @@ def test_a_rendering_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         )
 
 
-def test_without_truth_figures_are_null_with_a_reason(unscored: Scored) -> None:
+def test_without_ground_truth_scores_are_null_with_a_reason(unscored: Scored) -> None:
     _, found = unscored
     assert found["novel_view"]["psnr"] is None and "no test cameras" in found["novel_view"]["reason"]
     assert found["novel_pose"]["psnr"] is None and "no test camera" in found["novel_pose"]["reason"]
@@ -187,16 +187,16 @@ def test_without_truth_figures_are_null_with_a_reason(unscored: Scored) -> None:
     assert "no ground-truth surface" in found["novel_pose"]["geometry_reason"]
 
 
-def test_without_test_cameras_no_training_image_is_a_new_view(unscored: Scored) -> None:
+def test_without_test_cameras_training_images_are_not_novel_views(unscored: Scored) -> None:
     renders = unscored[0] / "renders"
     columns = ["novel_pose", "novel_pose_posed", "novel_pose_tracked"]
     assert sorted(p.name for p in renders.iterdir()) == [*columns, "training_view"]
     assert sorted(p.parent.name for p in (renders / "novel_pose").rglob("*.png")) == ["a", "b"]
 
 
-def test_new_poses_are_shown_as_fitted_as_tuned_and_as_tracked(scored: Scored) -> None:
-    """Expect a perfect score as fitted, since without per-frame changes the ball has the photograph's grey and the fit
-    is true; tuned poses are two pixels too high, tracked ones are darker as well."""
+def test_novel_poses_are_rendered_as_fitted_tuned_and_tracked(scored: Scored) -> None:
+    """As fitted, the score is perfect, because without per-frame changes the ball has the photograph's grey and the fit
+    is true. Tuned poses are two pixels too high, and tracked ones are darker as well."""
     out, found = scored[0] / "subject" / "evaluation", scored[1]
     true = seen(TEST_CAMERA, centre_m(3))
     lifted = seen(TEST_CAMERA, centre_m(3) + np.array([0, 0, TUNED_M]))
@@ -215,7 +215,7 @@ def test_new_poses_are_shown_as_fitted_as_tuned_and_as_tracked(scored: Scored) -
     assert mesh.bounds.mean(0) == pytest.approx(centre_m(3), abs=1e-3)
 
 
-def test_the_report_shows_all_three_side_by_side(scored: Scored) -> None:
+def test_the_report_shows_all_three_novel_pose_columns_side_by_side(scored: Scored) -> None:
     text = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
     for column in ("", "_posed", "_tracked"):
         assert f"{scored[1][f'novel_pose{column}']['psnr']:.2f}" in text
@@ -224,14 +224,14 @@ def test_the_report_shows_all_three_side_by_side(scored: Scored) -> None:
 
 
 def evaluated(base: Path, inputs: EvaluationInputs, **settings: Any) -> Scored:
-    """Evaluate a ball; return the folder and what was found."""
+    """Evaluate a ball; return the output folder and the metrics."""
     out = base / "evaluation"
     out.mkdir()
     return out, evaluate(inputs, EvaluationSettings(**{"max_meshes": 1, "report_rows": 1} | settings), out)
 
 
 def unreported(base: Path, capture: Capture, kind: str = "fast", **settings: Any) -> Scored:
-    """Evaluate a ball that a kind of field was trained on, without a report."""
+    """Evaluate a ball trained with a kind of field, without writing a report."""
     inputs = ball_inputs(capture, base / "stages")
     write_settings(inputs.training_folder, kind)
     with pytest.MonkeyPatch.context() as patch:
@@ -246,7 +246,7 @@ class Mist(BallAvatar):
         return torch.full((len(points_m),), 0.05)
 
 
-def test_a_field_without_a_surface_has_images_and_a_reason(tmp_path: Path) -> None:
+def test_a_field_without_a_surface_is_scored_on_images_and_gives_a_reason(tmp_path: Path) -> None:
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     inputs = ball_inputs(capture, tmp_path / "stages")
@@ -259,11 +259,11 @@ def test_a_field_without_a_surface_has_images_and_a_reason(tmp_path: Path) -> No
     assert reason in (out / "report.html").read_text()
 
 
-def test_a_surface_without_truth_is_a_surface(unscored: Scored) -> None:
+def test_a_surface_without_ground_truth_counts_as_a_surface(unscored: Scored) -> None:
     assert reason_without_surface(unscored[1]["novel_pose"]) is None
 
 
-def test_a_method_that_tunes_nothing_has_one_column(tmp_path: Path) -> None:
+def test_a_method_without_tuning_has_one_novel_pose_column(tmp_path: Path) -> None:
     out, found = unreported(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "neural_body")
     assert found["novel_pose_posed"]["reason"] == "no pose of these frames was tuned"
     assert found["novel_pose_tracked"]["reason"] == "these frames have no deformation of their own"
@@ -272,8 +272,9 @@ def test_a_method_that_tunes_nothing_has_one_column(tmp_path: Path) -> None:
         assert "neither ground-truth masks nor" in found[split]["reason"]
 
 
-def test_test_cameras_without_truth_are_scored_under_the_masks_of_the_recording(tmp_path: Path) -> None:
-    """Of two test cameras only c has masks, in which the ball lacks its left half; expect that and an even picture."""
+def test_test_cameras_without_truth_are_scored_with_the_recordings_masks(tmp_path: Path) -> None:
+    """Of two test cameras only c has masks, which lack the left half of the ball. Scores follow from that, for a
+    uniform rendering."""
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c", "d"))
     write_ball_masks(capture, "c")
     out, found = evaluated(tmp_path, ball_inputs(capture, tmp_path / "stages"))
@@ -289,27 +290,27 @@ def test_test_cameras_without_truth_are_scored_under_the_masks_of_the_recording(
     assert found["protocol"] == f"{PROTOCOL} Here, images are compared to {UNDER_GIVEN_MASKS}."
     text = html.unescape((out / "report.html").read_text())
     assert text.count(f"New poses, tracked: compared to {UNDER_GIVEN_MASKS}") == 2  # below the figures and in the notes
-    assert 'alt="Ground truth"' not in text and text.count('alt="Input × mask"') > 1  # not only the training view's
+    assert 'alt="Ground truth"' not in text and text.count('alt="Input × mask"') > 1  # not only for the training view
 
 
-def test_true_masks_come_before_those_of_the_recording(tmp_path: Path) -> None:
+def test_true_masks_take_precedence_over_the_recordings_masks(tmp_path: Path) -> None:
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     write_ball_masks(capture, "c")
     write_ball_truth(capture, RADIUS_M)
     truth = truth_of(tmp_path, capture)
     assert truth.on_black("c", 0)[1] == MASKED_IMAGE and protocol_of(truth) == PROTOCOL
-    shutil.rmtree(tmp_path / "ground_truth" / "masks" / "c")  # those of training cameras stay
+    shutil.rmtree(tmp_path / "ground_truth" / "masks" / "c")  # masks of training cameras stay
     truth = truth_of(tmp_path, capture)
     assert truth.on_black("c", 0)[1] == GIVEN_MASKED_IMAGE and list(truth.meshes()) == [0]
 
 
-def test_masks_of_training_cameras_score_nothing(tmp_path: Path) -> None:
+def test_masks_of_training_cameras_are_not_used_for_scores(tmp_path: Path) -> None:
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     write_ball_masks(capture, "a")
     assert not truth_of(tmp_path, capture).has_masks
 
 
-def test_a_method_without_poses_shows_no_new_ones(tmp_path: Path) -> None:
+def test_a_method_without_poses_renders_no_novel_poses(tmp_path: Path) -> None:
     out, found = unreported(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "nerfies")
     assert "Nerfies has no pose to set" in found["novel_pose"]["reason"]
     assert "Nerfies has no pose to set" in found["novel_pose"]["geometry_reason"]
@@ -317,8 +318,8 @@ def test_a_method_without_poses_shows_no_new_ones(tmp_path: Path) -> None:
     assert [p.stem for p in (out / "meshes").iterdir()] == ["000000"]
 
 
-def test_nothing_is_scored_on_pixels_of_training_cameras(tmp_path: Path) -> None:
-    """Give the truth of every image."""
+def test_pixels_of_training_cameras_are_never_scored(tmp_path: Path) -> None:
+    """This holds although every image has ground truth."""
     capture = write_ball_capture(tmp_path / "capture", "ball", ())
     write_ball_truth(capture, RADIUS_M)
     out, found = unreported(tmp_path, capture)
@@ -328,12 +329,12 @@ def test_nothing_is_scored_on_pixels_of_training_cameras(tmp_path: Path) -> None
     assert found["holdout"] is None and "evaluation.holdout=each" in found["holdout_reason"]
     rendered = sorted((out / "renders" / "novel_pose").rglob("*.png"))
     assert [p.parent.name for p in rendered] == ["a", "b"]  # for inspection
-    assert len(list((out / "renders" / "novel_pose_tracked").rglob("*.png"))) == 1  # what the report shows
-    assert found["novel_view"]["geometry"]["n"] == 1  # no pixels are needed
+    assert len(list((out / "renders" / "novel_pose_tracked").rglob("*.png"))) == 1  # only the one in the report
+    assert found["novel_view"]["geometry"]["n"] == 1  # geometry needs no pixels
 
 
 class _Page(HTMLParser):
-    """Collect headings, links, and everything that a browser would load or run."""
+    """Parse a page: headings, links, and everything that a browser would load or run."""
 
     def __init__(self, text: str):
         super().__init__()
@@ -356,7 +357,7 @@ class _Page(HTMLParser):
             self._in_heading = False
 
 
-def test_report_has_every_section_and_loads_nothing(scored: Scored) -> None:
+def test_the_report_has_every_section_and_loads_nothing(scored: Scored) -> None:
     text = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
     page = _Page(text)
     galleries = ["Training views", "New views", "New poses", "Surface"]
@@ -368,7 +369,7 @@ def test_report_has_every_section_and_loads_nothing(scored: Scored) -> None:
     assert "://" not in text and "@import" not in text and not re.search(r"url\(", text)
 
 
-def test_report_shows_figures_findings_and_charts(scored: Scored) -> None:
+def test_the_report_shows_scores_findings_and_charts(scored: Scored) -> None:
     base, found = scored
     text = (base / "subject" / "evaluation" / "report.html").read_text()
     assert f"{found['novel_view']['psnr']:.2f}" in text
@@ -382,26 +383,26 @@ def test_report_shows_figures_findings_and_charts(scored: Scored) -> None:
         assert f'alt="{caption}"' in text, caption
 
 
-def test_report_escapes_what_captures_say(scored: Scored, unscored: Scored) -> None:
+def test_the_report_escapes_text_from_captures(scored: Scored, unscored: Scored) -> None:
     assert "&lt;script&gt;alert(1)" in (unscored[0] / "report.html").read_text()
     assert "&lt;script&gt;alert(1)" in (scored[0] / "subject" / "evaluation" / "report.html").read_text()
     assert "script" not in _Page((unscored[0] / "report.html").read_text()).tags
 
 
-def test_report_without_truth_says_so(unscored: Scored) -> None:
+def test_the_report_says_if_there_is_no_ground_truth(unscored: Scored) -> None:
     text = (unscored[0] / "report.html").read_text()
     assert "the capture has no test camera" in text and "the report shows training views instead" in text
     assert 'alt="Ground truth"' not in text and 'alt="Input × mask"' in text
     assert "No history was recorded" in text
 
 
-def test_mesh_frames_are_spread_over_those_with_a_truth() -> None:
+def test_mesh_frames_are_spread_over_frames_with_a_true_surface() -> None:
     truths = dict.fromkeys((0, 4, 8, 12, 16, 20), trimesh.Trimesh())
     assert mesh_frames(tuple(range(24)), truths, 4) == [0, 8, 12, 20]
     assert mesh_frames(tuple(range(24)), {}, 3) == [0, 12, 23]
     assert mesh_frames((1, 2), truths, 4) == [1, 2]
 
 
-def test_doubts_about_the_recording_stand_in_the_first_screen(scored: Scored) -> None:
+def test_doubts_about_the_recording_are_shown_at_the_top_of_the_report(scored: Scored) -> None:
     page = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
     assert "left and right are exchanged" in page.partition("<nav>")[0]

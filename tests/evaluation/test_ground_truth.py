@@ -19,13 +19,13 @@ def truth(tmp_path: Path) -> GroundTruth:
     return GroundTruth(tmp_path, capture)
 
 
-def test_the_photograph_under_its_mask_stands_in_for_on_black(truth: GroundTruth) -> None:
+def test_without_on_black_images_the_masked_photograph_is_used(truth: GroundTruth) -> None:
     image, source = truth.on_black("c", 1)
     assert source == "image x ground-truth mask"
     assert np.array_equal(image[..., 0], seen(truth.capture.cameras["c"], centre_m(1)) * PHOTOGRAPHED)
 
 
-def test_on_black_comes_first_and_at_the_camera_size(truth: GroundTruth) -> None:
+def test_on_black_images_take_precedence_and_are_resized_to_the_camera(truth: GroundTruth) -> None:
     path = truth.folder / "ground_truth" / "on_black" / "c" / "000001.jpg"
     path.parent.mkdir(parents=True)
     cv2.imwrite(str(path), np.full((128, 128, 3), 90, np.uint8))
@@ -34,9 +34,9 @@ def test_on_black_comes_first_and_at_the_camera_size(truth: GroundTruth) -> None
     assert np.array_equal(image, np.full((64, 64, 3), 90))
 
 
-def test_a_mask_of_the_recording_is_shrunk_by_area(truth: GroundTruth) -> None:
-    """Mask columns 5 and up of 256: of the four columns that become column 1, three are the person's and the first is
-    not."""
+def test_a_larger_mask_is_downscaled_by_area(truth: GroundTruth) -> None:
+    """Of 256 columns, those from 5 on are masked. Of the four columns that become column 1, three belong to the person
+    and the first does not."""
     mask = np.zeros((256, 256), np.uint8)
     mask[:, 5:] = 255
     cv2.imwrite(str(truth.folder / "ground_truth" / "masks" / "c" / "000001.png"), mask)
@@ -44,7 +44,7 @@ def test_a_mask_of_the_recording_is_shrunk_by_area(truth: GroundTruth) -> None:
 
 
 def bent(truth: GroundTruth) -> GroundTruth:
-    """Return truth of a camera whose lens distorts, recorded at twice its size."""
+    """Return truth of a camera with lens distortion, recorded at twice its size."""
     camera = truth.capture.cameras["c"]
     size_px = (2 * camera.width_px, 2 * camera.height_px)
     lenses = {"c": (camera.scaled(2).K.tolist(), [0.0, 0.0, 0.5, 0.5])}
@@ -63,8 +63,8 @@ def test_truth_of_another_shape_or_that_cannot_be_undistorted_is_refused(
         (bent(truth) if lens else truth).mask("c", 1)
 
 
-def test_truth_as_large_as_the_camera_or_the_recording_is_taken(truth: GroundTruth) -> None:
-    """Round 64 px of 85 x 64 to 85 x 64: a picture of 1024 x 768 has the same shape but for rounding."""
+def test_truth_of_the_cameras_shape_or_the_recordings_size_is_accepted(truth: GroundTruth) -> None:
+    """The camera has 85 x 64 px. An image of 1024 x 768 px has the same aspect ratio up to rounding."""
     wide = replace(truth.capture.cameras["c"], width_px=85)
     odd = replace(truth, capture=replace(truth.capture, cameras={**truth.capture.cameras, "c": wide}))
     path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
@@ -74,20 +74,20 @@ def test_truth_as_large_as_the_camera_or_the_recording_is_taken(truth: GroundTru
     assert bent(truth).mask("c", 1).shape == (64, 64)
 
 
-def test_truth_is_of_the_instant_of_the_photograph(truth: GroundTruth) -> None:
-    """Let camera c record the instant of frame 1 in its frame 2."""
-    in_step = replace(truth, capture=truth.capture.synchronised({"c": 1.0}))
+def test_truth_is_synchronised_with_the_photograph(truth: GroundTruth) -> None:
+    """Camera c records the instant of frame 1 in its frame 2."""
+    synchronised = replace(truth, capture=truth.capture.synchronised({"c": 1.0}))
     expected = seen(truth.capture.cameras["c"], centre_m(2))
-    assert np.array_equal(in_step.mask("c", 1), expected)
-    assert np.array_equal(in_step.on_black("c", 1)[0][..., 0], expected * PHOTOGRAPHED)
+    assert np.array_equal(synchronised.mask("c", 1), expected)
+    assert np.array_equal(synchronised.on_black("c", 1)[0][..., 0], expected * PHOTOGRAPHED)
     path = truth.folder / "ground_truth" / "on_black" / "c" / "000002.jpg"
     path.parent.mkdir(parents=True)
     cv2.imwrite(str(path), np.full((64, 64, 3), 90, np.uint8))
-    assert in_step.on_black("c", 1)[0].max() == 90
+    assert synchronised.on_black("c", 1)[0].max() == 90
 
 
 def test_truth_is_undistorted_as_photographs_are(truth: GroundTruth) -> None:
-    """Compare with the Normaliser that ingest uses on photographs; lens distortion moves the outline."""
+    """Compare with the Normaliser that ingest applies to photographs; lens distortion moves the outline."""
     camera = truth.capture.cameras["c"]
     size_px = (camera.width_px, camera.height_px)
     distortion = np.array([0.0, 0.0, 0.5, 0.5])
@@ -101,13 +101,13 @@ def test_truth_is_undistorted_as_photographs_are(truth: GroundTruth) -> None:
     assert np.array_equal(found, expected) and not np.array_equal(found, straight)
 
 
-def test_a_mask_that_nobody_drew_is_not_there(truth: GroundTruth) -> None:
+def test_has_mask_is_false_without_a_mask_file(truth: GroundTruth) -> None:
     assert truth.has_mask("c", 1)
     (truth.folder / "ground_truth" / "masks" / "c" / "000001.png").unlink()
     assert not truth.has_mask("c", 1)
 
 
-def test_a_missing_mask_is_named(truth: GroundTruth) -> None:
+def test_a_missing_mask_is_reported_by_name(truth: GroundTruth) -> None:
     path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
     path.unlink()
     with pytest.raises(InputError, match=r"000001\.png"):
@@ -139,7 +139,7 @@ def test_surfaces_that_cannot_be_compared_are_refused(
         truth.meshes()
 
 
-def test_more_than_fits_in_memory_is_refused(truth: GroundTruth, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_surfaces_that_do_not_fit_in_memory_are_refused(truth: GroundTruth, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> np.ndarray:
         raise MemoryError("Unable to allocate 1.07 PiB")
 

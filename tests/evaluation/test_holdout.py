@@ -35,7 +35,7 @@ CAMERAS = ("a", "b", "c")
 
 
 def three_cameras(folder: Path) -> Capture:
-    """Return a capture whose three cameras all train."""
+    """Return a capture with three training cameras."""
     capture = write_ball_capture(folder, "ball", ("c",))
     return replace(capture, train_cameras=CAMERAS, test_cameras=())
 
@@ -48,7 +48,7 @@ def own_mask(capture: Capture, camera: str, frame: int) -> np.ndarray:
 
 
 def held_out(base: Path, capture: Capture, camera: str) -> tuple[Path, dict[str, Any]]:
-    """Score a camera that training did not use; return the folder and the scores. Frame 1 has no mask."""
+    """Score a camera that training did not use; return the output folder and the scores. Frame 1 has no mask."""
     masks = {(n, f): encode(own_mask(capture, n, f)) for n in CAMERAS for f in FRAMES if f != 1}
     training, out = base / "training", base / camera
     for folder in (training, out):
@@ -61,14 +61,15 @@ def held_out(base: Path, capture: Capture, camera: str) -> tuple[Path, dict[str,
 
 
 def psnr_db(capture: Capture, camera: str, frame: int, grey: int) -> float:
-    """Return the PSNR of the whole ball in a grey against half of it in the photograph's."""
+    """Return the PSNR of a rendering that shows the whole ball in a grey level, against a photograph that shows its
+    right half."""
     mask, whole = own_mask(capture, camera, frame), seen(capture.cameras[camera], centre_m(frame))
     error = (whole * grey / 255.0 - mask * PHOTOGRAPHED / 255.0)[mask_box(mask)]
     return float(-10 * np.log10((error**2).mean()))
 
 
-def test_a_camera_left_out_is_scored_on_its_photographs_under_its_own_masks(tmp_path: Path) -> None:
-    """Give a truth that says otherwise; expect training frames as trained, novel poses animated."""
+def test_a_held_out_camera_is_scored_on_its_own_masked_photographs(tmp_path: Path) -> None:
+    """The ground truth says otherwise and is ignored. Training frames are rendered as trained, novel poses animated."""
     capture = three_cameras(tmp_path / "capture")
     write_ball_truth(capture, 0.1)
     out, found = held_out(tmp_path, capture, "b")
@@ -83,7 +84,7 @@ def test_a_camera_left_out_is_scored_on_its_photographs_under_its_own_masks(tmp_
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_pose", "novel_view"]
 
 
-def test_figures_are_gathered_by_camera_with_their_mean(tmp_path: Path) -> None:
+def test_held_out_scores_are_collected_by_camera_with_their_mean(tmp_path: Path) -> None:
     def folder(camera: str, view_db: float | None, pose_db: float | None) -> Path:
         path = tmp_path / camera
         path.mkdir()
@@ -102,8 +103,8 @@ def test_figures_are_gathered_by_camera_with_their_mean(tmp_path: Path) -> None:
     assert "has test cameras" in collect_held_out(with_test_camera, [])["holdout_reason"]
 
 
-def test_the_report_has_a_row_for_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hnerf.avatar.surface.POSED_CELLS", 96)  # of its surfaces nobody looks at anything here
+def test_the_report_has_a_row_for_each_held_out_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hnerf.avatar.surface.POSED_CELLS", 96)  # surfaces do not matter here
     monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (75, 100))
     capture = three_cameras(tmp_path / "capture")
     folders = [held_out(tmp_path, capture, camera)[0] for camera in ("a", "b")]
@@ -129,12 +130,12 @@ def test_cameras_that_cannot_be_left_out_are_refused(train: tuple[str, ...], hol
         held_out_cameras(train, (), holdout)
 
 
-def test_a_name_that_no_camera_has_is_refused_although_test_cameras_score_the_capture() -> None:
+def test_an_unknown_camera_is_refused_even_with_test_cameras() -> None:
     with pytest.raises(InputError, match=r"evaluation\.holdout=d: no such training camera; there are a, b, c"):
         held_out_cameras(CAMERAS, ("t",), "d")
 
 
-def test_cameras_are_left_out_one_by_one_or_in_turn() -> None:
+def test_one_camera_or_each_in_turn_is_held_out() -> None:
     assert held_out_cameras(CAMERAS, (), None) == ()
     assert held_out_cameras(CAMERAS, (), "b") == ("b",)
     assert held_out_cameras(CAMERAS, (), "each") == CAMERAS

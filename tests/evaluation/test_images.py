@@ -15,8 +15,8 @@ from hnerf.evaluation.views import View
 from tests.evaluation.ball import RADIUS_M, BallAvatar, ball_fit, write_ball_capture, write_ball_truth
 
 
-def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:
-    """Store a pixel half covered by red and one of black hair; a viewer that ignores alpha shows them over black."""
+def test_renderings_are_rgba_with_colour_over_black(tmp_path: Path) -> None:
+    """One pixel is half covered by red, one fully by black hair. A viewer that ignores alpha shows them over black."""
     alpha = torch.tensor([[0.5, 1.0]])
     picture = rgba(Rendering(torch.tensor([[[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]]), alpha, alpha))
     assert picture.tolist() == [[[128, 0, 0, 128], [0, 0, 0, 255]]]
@@ -27,20 +27,20 @@ def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:
     assert stored is not None and stored[0, 0].tolist() == [0, 0, 128, 128]  # BGRA
 
 
-def test_a_mean_is_of_what_is_known_zeros_included() -> None:
+def test_means_skip_unknown_values_but_include_zeros() -> None:
     """A rendering that misses the person altogether has a mask_iou of 0."""
     assert mean_of([0.0, None, 0.5, 1.0]) == 0.5
     assert mean_of([None]) is None
 
 
-def test_a_picture_without_coverage_is_no_rendering(tmp_path: Path) -> None:
+def test_an_image_without_alpha_is_refused_as_a_rendering(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(InputError, match=r"a\.png: no readable image with an alpha channel"):
         read_rgba(tmp_path / "a.png")
 
 
-def test_an_image_that_does_not_show_the_person_is_counted_and_not_scored(tmp_path: Path) -> None:
-    """Of two images, the person has left one."""
+def test_images_without_the_person_are_counted_but_not_scored(tmp_path: Path) -> None:
+    """In one of two images, the person has left."""
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     write_image(tmp_path / "ground_truth" / "masks" / "c" / "000001.png", np.zeros((64, 64, 3), np.uint8))
@@ -51,11 +51,11 @@ def test_an_image_that_does_not_show_the_person_is_counted_and_not_scored(tmp_pa
     assert [row["frame"] for row in found["per_image"]] == [0]
 
 
-def test_seconds_are_of_one_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_time_is_per_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two images take 12 s."""
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     clock = iter((100.0, 112.0))
     monkeypatch.setattr(module.time, "perf_counter", lambda: next(clock))
-    monkeypatch.setattr(module, "tracked", lambda items, *_: items)  # which looks at the clock, too
+    monkeypatch.setattr(module, "tracked", lambda items, *_: items)  # which reads the clock too
     views = [View("novel_view", "c", frame) for frame in (0, 1)]
     assert render({"novel_view": BallAvatar(ball_fit())}, capture, views, tmp_path) == 6.0

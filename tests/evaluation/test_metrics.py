@@ -18,8 +18,8 @@ def test_ssim_of_flat_images_is_its_luminance_term() -> None:
 
 
 def test_ssim_of_one_window_by_hand() -> None:
-    """Take images as large as the window, 11 px: one number for each channel, from means, variances and the covariance
-    under a Gaussian of 1.5 px that sums to 1, with C1 = 0.01^2 and C2 = 0.03^2."""
+    """The images are as large as the window, 11 px, so each channel gives one number, from means, variances and the
+    covariance under a Gaussian of 1.5 px that sums to 1, with C1 = 0.01^2 and C2 = 0.03^2."""
     a, b = np.random.default_rng(0).uniform(size=(2, 11, 11, 3))
     b = (a + b) / 2
     along = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
@@ -31,7 +31,7 @@ def test_ssim_of_one_window_by_hand() -> None:
     assert ssim(a, b) == pytest.approx((luminance * (2 * cov + 9e-4) / (var_a + var_b + 9e-4)).mean(), abs=1e-9)
 
 
-def test_mask_box_is_padded_and_cut_to_the_image() -> None:
+def test_mask_box_is_padded_and_clipped_to_the_image() -> None:
     mask = np.zeros((100, 80), bool)
     mask[30:41, 5:9] = True
     rows, columns = mask_box(mask)
@@ -39,17 +39,18 @@ def test_mask_box_is_padded_and_cut_to_the_image() -> None:
     assert range(80)[columns] == range(0, 29)  # 5 - 20 is outside; 8 + 20
 
 
-def test_mask_iou_counts_pixels_covered_by_more_than_a_half() -> None:
+def test_mask_iou_counts_pixels_with_more_than_half_coverage() -> None:
     coverage = np.zeros((2, 4), np.uint8)
     coverage[0, :3] = 128
-    coverage[1, :] = 127  # no more than a half
+    coverage[1, :] = 127  # just below one half
     mask = np.zeros((2, 4), bool)
     mask[0, 1:] = True
     assert mask_iou(coverage, mask) == pytest.approx(2 / 4)
 
 
-def test_black_hair_on_black_counts() -> None:
-    """Draw a head of 4 pixels, the upper two black hair in image and rendering, which brightness would miss."""
+def test_mask_iou_uses_coverage_not_brightness() -> None:
+    """A head has 4 pixels, of which the upper two are black hair in image and rendering. By brightness, they would be
+    missed."""
     mask = np.zeros((16, 16), bool)
     mask[2:4, 2:4] = True
     reference = np.zeros((16, 16, 3), np.uint8)
@@ -60,8 +61,9 @@ def test_black_hair_on_black_counts() -> None:
     assert score_image(rendered, reference, mask)["mask_iou"] == pytest.approx(2 / 4)
 
 
-def test_floors_of_a_person_of_two_greys() -> None:
-    """Take 4 pixels in a box of 42 x 42: 0.2 and 0.4, two each; their mean 0.3 is 0.1 off everywhere in the mask."""
+def test_trivial_psnr_of_a_person_with_two_grey_levels() -> None:
+    """The mask has 4 pixels in a box of 42 x 42: two of 0.2 and two of 0.4. Their mean 0.3 is 0.1 off everywhere in the
+    mask."""
     reference = np.zeros((100, 100, 3), np.uint8)
     mask = np.zeros((100, 100), bool)
     mask[50:52, 50:52] = True
@@ -71,7 +73,7 @@ def test_floors_of_a_person_of_two_greys() -> None:
     assert found["one_colour_psnr"] == pytest.approx(-10 * np.log10(4 * 0.1**2 / 42**2), abs=1e-4)
 
 
-def test_score_image_looks_into_the_box_only() -> None:
+def test_score_image_uses_only_pixels_inside_the_box() -> None:
     reference = np.zeros((100, 100, 3), np.uint8)
     mask = np.zeros((100, 100), bool)
     mask[50, 50] = True

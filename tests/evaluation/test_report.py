@@ -13,7 +13,7 @@ from hnerf.evaluation.views import View
 from tests.evaluation.ball import ball_inputs, write_ball_capture
 
 
-def test_readable_values() -> None:
+def test_values_are_formatted_readably() -> None:
     assert [readable(v) for v in (None, True, 3, 0.123456, "x", [], ["a", 1])] == [
         "–",
         "yes",
@@ -27,7 +27,7 @@ def test_readable_values() -> None:
     assert readable([[0.5, 2.0, 1.0]] * 5) == "15 values from 0.5 to 2"
 
 
-def test_dicts_of_plain_values_are_rows_of_a_table() -> None:
+def test_dicts_of_plain_values_become_table_rows() -> None:
     assert is_table_rows([{"a": 1}, {"b": [2]}])
     assert is_table_rows({"x": {"a": 1}}.values())
     assert not is_table_rows({"x": {"a": {"b": 1}}}.values())
@@ -35,7 +35,7 @@ def test_dicts_of_plain_values_are_rows_of_a_table() -> None:
     assert not any(is_table_rows(value) for value in others)
 
 
-def test_summary_shows_a_dash_where_there_is_no_figure() -> None:
+def test_the_summary_shows_a_dash_for_missing_scores() -> None:
     geometry = {"chamfer_mm": 8.04, "chamfer_l2_e3": 0.1234, "normal_consistency": 0.95, "iou": 0.9}
     view = {"psnr": 30.126, "ssim": 0.9, "mask_iou": 0.95, "geometry": geometry}
     pose = {"psnr": None, "ssim": None, "mask_iou": None, "geometry": None}
@@ -47,7 +47,7 @@ def test_summary_shows_a_dash_where_there_is_no_figure() -> None:
     assert values["Chamfer"] == ["0.123", "–", "–", "–"]
 
 
-def test_costs_have_a_row_a_part_of_a_stage() -> None:
+def test_costs_have_a_row_for_each_part_of_a_stage() -> None:
     stages = {
         "Calibration": {},
         "Body fit": {"seconds": {"start": 0.5, "outlines": 12.25}},
@@ -62,13 +62,13 @@ def test_costs_have_a_row_a_part_of_a_stage() -> None:
     ]
 
 
-def test_seconds_of_the_fit_are_among_the_costs(tmp_path: Path) -> None:
+def test_costs_include_the_duration_of_the_body_fit(tmp_path: Path) -> None:
     inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
     stages = stage_reports(replace(inputs, fit_seconds={"start": 0.5}))
     assert costs(stages, {"seconds_per_image": 0.1})[0] == ("Body fit: start, seconds", "0.5")
 
 
-def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) -> None:
+def test_notes_list_unscored_images_and_the_reference(tmp_path: Path) -> None:
     inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
     view = {"reference": "image x ground-truth mask", "without_mask": 3, "without_person": 2}
     rain = {f"novel_pose{column}": {"reason": "rain"} for column in ("", "_posed", "_tracked")}
@@ -82,8 +82,8 @@ def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) ->
     ]
 
 
-def test_the_worst_image_of_a_split_is_shown_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One row is of the split's first frame; the worst image is another's."""
+def test_the_worst_image_of_a_split_is_shown_with_a_label(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The only row of samples shows the split's first frame; the worst image is in another frame."""
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     for frame in (0, 1, 2):
         write_image(View("novel_view", "c", frame).path(tmp_path), np.zeros((64, 64, 4), np.uint8))
