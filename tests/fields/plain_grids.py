@@ -1,19 +1,19 @@
-"""What hnerf/fields/sparse_grids.py is compared with: the same grids with all of their nodes, in plain torch."""
+"""Reference for hnerf/fields/sparse_grids.py: the same grids with all of their nodes, in plain torch."""
 
 import torch
 from torch import Tensor, nn
 
 
 def everywhere(nodes_m: Tensor, beyond_m: float) -> Tensor:
-    """Return that something is to be learned at all nodes, for SparseGrids."""
+    """Return True for all nodes, for SparseGrids: features are learned everywhere."""
     return torch.ones(len(nodes_m), dtype=torch.bool)
 
 
 class FeatureGrids(nn.Module):
-    """Dense feature grids of several resolutions over a box, trilinearly interpolated and concatenated; features start
+    """Dense feature grids of several resolutions over a box, interpolated trilinearly and concatenated. Features start
     at zero and stay zero where nothing is learned.
 
-    cells: cells of each level along the box's longest side; channels: features per level.
+    cells: number of cells of each level along the box's longest side; channels: features per level.
     """
 
     lower_m: Tensor
@@ -31,8 +31,8 @@ class FeatureGrids(nn.Module):
         self.width = channels * len(cells)
 
     def forward(self, y_m: Tensor) -> Tensor:
-        """Interpolate features at positions (N, 3) in canonical metres: (N, levels * channels). Positions outside the
-        box take the border's features."""
+        """Interpolate features (N, levels * channels) at positions (N, 3) in canonical metres. Positions outside the
+        box take the features of its border."""
         unit = 2 * (y_m - self.lower_m) / (self.upper_m - self.lower_m) - 1
         at = unit[None, None, None]
         found = [

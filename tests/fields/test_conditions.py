@@ -1,4 +1,4 @@
-"""Conditioning of the networks, and the random numbers of a step."""
+"""Conditions of the networks, and the random numbers of a training step."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from tests.body.two_bone import two_bone_rig
 
 
 def test_conditions_by_hand() -> None:
-    """One of three joints is free; T's translation of (1, 2, 3) m is in scene units of 2 m."""
+    """One of three joints is free. T's translation of (1, 2, 3) m is given in scene units of 2 m."""
     theta, root = torch.arange(9.0).view(1, 3, 3), torch.eye(4)[None].clone()
     root[0, :2, :2] = torch.tensor([[0.0, -1], [1, 0]])
     root[0, :3, 3] = torch.tensor([1.0, 2, 3])
@@ -18,29 +18,29 @@ def test_conditions_by_hand() -> None:
     assert found.frame_row.tolist() == [5]
 
 
-def spread(noise: Tensor) -> None:
-    """Assert a mean of 0 and a standard deviation of 0.1 of each column."""
+def expect_gaussian_noise(noise: Tensor) -> None:
+    """Assert that each column has a mean of 0 and a standard deviation of 0.1."""
     assert (noise.mean(0).abs() < 0.01).all()
     assert ((noise.std(0) - 0.1).abs() < 0.01).all()
 
 
 def test_noise_on_pose_and_root() -> None:
-    """Every number of every frame gets its own Gaussian noise; the frame row stays."""
+    """Every number of every frame gets its own Gaussian noise; the frame row is unchanged."""
     given = Conditions(torch.full((2000, 3), 0.7), torch.full((2000, 12), -0.3), torch.arange(2000))
     noisy = given.with_noise(0.1, torch.Generator().manual_seed(0))
     both = torch.cat([noisy.pose - given.pose, noisy.root - given.root], 1)
-    spread(both)
+    expect_gaussian_noise(both)
     apart = torch.corrcoef(both.T) - torch.eye(15)
     assert apart.abs().max() < 0.1
-    assert 0.002 < (both.abs() > 0.3).float().mean() < 0.0035  # of a Gaussian 0.0027 lie beyond three deviations
+    assert 0.002 < (both.abs() > 0.3).float().mean() < 0.0035  # 0.0027 of a Gaussian lie beyond 3 sigma
     assert torch.equal(noisy.frame_row, given.frame_row)
 
 
-def test_draws_of_a_step() -> None:
-    """Uniform numbers in [0, 1) and Gaussian noise on directions, all different."""
+def test_random_draws_of_a_training_step() -> None:
+    """Draws are uniform numbers in [0, 1) and Gaussian noise on directions, all uncorrelated."""
     draws = Draws.random(2000, 3, 0.1, torch.Generator().manual_seed(0))
     assert draws.view is not None and draws.probe is not None
-    spread(draws.view)
+    expect_gaussian_noise(draws.view)
     uniform = torch.cat([draws.jitter, draws.fine, draws.background, draws.probe[:, None]], 1)
     assert uniform.shape == (2000, 10) and uniform.min() >= 0 and uniform.max() < 1
     assert (uniform.mean(0) - 0.5).abs().max() < 0.03 and (uniform.std(0) - 12**-0.5).abs().max() < 0.02
@@ -48,7 +48,7 @@ def test_draws_of_a_step() -> None:
     assert apart.abs().max() < 0.1
 
 
-def test_a_rendering_draws_nothing() -> None:
+def test_rendering_uses_no_random_numbers() -> None:
     """Samples lie in the middle of their strata, over black, without noise or regularisation."""
     still = Draws.deterministic(2, 3, torch.device("cpu"))
     assert (still.jitter == 0.5).all() and (still.fine == 0.5).all() and not still.background.any()

@@ -1,4 +1,4 @@
-"""Per-frame deformation: nodes and their weights by hand, gradients in double precision, a moving surface."""
+"""Per-frame deformation: nodes and their weights by hand, gradients in double precision, and a moving surface."""
 
 import numpy as np
 import pytest
@@ -28,13 +28,13 @@ def deformation(nodes: int) -> FrameDeformation:
     return found
 
 
-def test_nodes_lie_far_from_each_other():
-    """On a line, from 0: 10 is farthest, then 4 (4 from 0 and 6 from 10), then 7 (3 from 4 and from 10)."""
+def test_farthest_point_sampling_by_hand():
+    """On a line, starting at 0: 10 is farthest, then 4 (4 from 0 and 6 from 10), then 7 (3 from 4 and from 10)."""
     line = np.array([0.0, 1.0, 4.0, 7.0, 10.0])[:, None]
     assert farthest_points(line, 4) == [0, 4, 2, 3]
 
 
-def test_all_follow_a_single_node_and_none_where_no_frame_is_meant():
+def test_a_single_node_moves_all_points_in_a_frame_and_none_without_a_frame():
     moments = torch.tensor([0, 1, -1])
     described = at([4, 5, 6], [0.5, 0.25, 0.25])
     moved = torch.cat([deformation(1)(described, m[None])[0] for m in moments])
@@ -42,9 +42,10 @@ def test_all_follow_a_single_node_and_none_where_no_frame_is_meant():
 
 
 @pytest.mark.parametrize("size_m", [1.0, 2.0])
-def test_shares_by_hand(size_m: float):
-    """Nodes at corners 0 and 6, opposite ones. All corners are within 1 of one of them, so nodes reach 0.5: corner 1, 1
-    from node 0 and sqrt(2) from node 6, follows node 0 with 1 / (1 + exp((1 - 2) / 0.25)), whatever the unit."""
+def test_node_weights_by_hand(size_m: float):
+    """The nodes are the opposite corners 0 and 6. All corners are within 1 of one of them, so nodes have a reach of
+    0.5. Corner 1, at 1 from node 0 and sqrt(2) from node 6, follows node 0 with weight 1 / (1 + exp((1 - 2) / 0.25)),
+    whatever the unit."""
     found = FrameDeformation(size_m * RIG.vertices_m, RIG.faces, 2, frames=1)
     found.displacement.data[0, 0] = torch.tensor([1.0, 0.0, 0.0])
     moved, normal_displacement = found(at([1, 1, 1], [0.2, 0.3, 0.5]), torch.tensor([0]))
@@ -64,8 +65,9 @@ def test_gradient_in_double():
     assert torch.autograd.gradcheck(moved, found.displacement.detach().requires_grad_())
 
 
-def test_poses_without_a_frame_of_their_own_are_displaced_as_frames_are_in_the_mean():
-    """Frames 0 and 2 move by 1 cm along x and by 2 cm upwards: frame 1 and poses of no frame get 0.5 cm and 1 cm."""
+def test_poses_without_a_frame_get_the_mean_displacement_of_frames():
+    """Frames 0 and 2 move by 1 cm along x and by 2 cm upwards, so frame 1 and poses of no frame move by 0.5 cm and 1
+    cm."""
     found = FrameDeformation(RIG.vertices_m, RIG.faces, 2, frames=3)
     found.displacement.data[[0, 2]] = CENTIMETRES[:, None]
     found.average_over_frames(torch.tensor([0, 2]))
@@ -74,9 +76,9 @@ def test_poses_without_a_frame_of_their_own_are_displaced_as_frames_are_in_the_m
     torch.testing.assert_close(found.displacement.data, expected)
 
 
-def test_how_far_vertices_go_outwards():
-    """In frame 0 all vertices move 1 cm along x: corner 0, at the origin, inwards, corner 1, at (1, 0, 0), outwards. In
-    frame 1 all move 2 cm up, corner 1 inwards."""
+def test_displacement_along_vertex_normals():
+    """In frame 0 all vertices move 1 cm along x: corner 0, at the origin, moves inwards, corner 1, at (1, 0, 0),
+    outwards. In frame 1 all move 2 cm up, so corner 1 moves inwards."""
     found = deformation(1)
     across, up, nowhere = found.normal_displacement(torch.tensor([0, 1, -1]))
     torch.testing.assert_close(across, 0.01 * found.normals[:, 0])
@@ -85,9 +87,9 @@ def test_how_far_vertices_go_outwards():
 
 
 @pytest.mark.parametrize("moved_m", [[0.0, 0.0, 0.02], [0.015, -0.01, 0.0]])
-def test_a_frame_moves_all_that_the_field_knows(moved_m: list[float]):
-    """A box displaced by m in frame 1, along the normal or across it, has at x + m the distance (with any residual) and
-    the colour that it has at x in frame 0 and in a pose of no frame."""
+def test_a_frames_displacement_moves_distance_and_colour(moved_m: list[float]):
+    """In frame 1 a box is displaced by m, along the normal or across it. At x + m it has the distance (with any
+    residual) and the colour that it has at x in frame 0 and in a pose of no frame."""
     torch.manual_seed(0)
     settings = FastFieldSettings(
         outer_m=0.1, inner_m=0.1, samples=8, geometry_cells=(16,), colour_cells=(16,), pose_width=1, nodes=1
@@ -114,8 +116,8 @@ def test_a_frame_moves_all_that_the_field_knows(moved_m: list[float]):
     torch.testing.assert_close(moved, torch.tensor([moved_m, [0.0] * 3, [0.0] * 3])[:, None].expand(-1, 2, -1))
 
 
-def test_a_field_knows_how_a_frame_moves_it_beside_the_mean_of_frames():
-    """Moved by 2 and by 4 cm in frames 0 and 1, and by 3 cm in poses of no frame."""
+def test_frame_displacements_are_relative_to_the_mean_over_frames():
+    """The surface moves by 2 and by 4 cm in frames 0 and 1, and by 3 cm in poses of no frame."""
     settings = FastFieldSettings(outer_m=0.1, inner_m=0.1, geometry_cells=(16,), colour_cells=(16,), nodes=1)
     rig = box_rig(splits=3)
     field = FastField(rig, settings, frames=2)

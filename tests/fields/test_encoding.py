@@ -5,6 +5,6 @@ from hnerf.fields.encoding import positional_encoding
 
 
 def test_positional_encoding_by_hand():
-    """0.5 with two octaves: 0.5, sin(pi/2), sin(pi), cos(pi/2), cos(pi)."""
+    """0.5 with two octaves is 0.5, sin(pi/2), sin(pi), cos(pi/2), cos(pi)."""
     encoded = positional_encoding(torch.tensor([[0.5]]), 2)
     assert encoded[0].tolist() == pytest.approx([0.5, 1, 0, 0, -1], abs=1e-6)

@@ -1,4 +1,5 @@
-"""Shell of the fast field: it is tightened to what is visible, and rays that miss it are not evaluated."""
+"""The fast field: its shell, which is tightened to the visible part and outside of which nothing is evaluated, and the
+surface that rays see."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -55,13 +56,14 @@ def field_of(sharpness_per_m: float, settings: FastFieldSettings = SETTINGS) -> 
 
 
 def from_above(*origins_m: tuple[float, float, float]) -> Rays:
-    """Return rays along -z at the first body."""
+    """Return rays along -z in the frame of the first body."""
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(len(origins_m), 3)
     return Rays(torch.tensor(origins_m), down, torch.zeros(len(origins_m), dtype=torch.long))
 
 
 def test_the_shell_is_tightened_to_where_the_opacity_changes():
-    """Untrained, d_hat is d: a logistic of 1000 per metre saturates 5 mm from the skin, one of 10 nowhere."""
+    """In an untrained field, d_hat is d. A logistic of 1000 per metre saturates 5 mm from the skin, one of 10 per metre
+    nowhere."""
     _, conditions = standing()
     sharp, soft = field_of(1000.0), field_of(10.0)
     for field in (sharp, soft):
@@ -74,7 +76,7 @@ def test_the_shell_is_tightened_to_where_the_opacity_changes():
     assert soft.inner_m.max().item() == pytest.approx(SETTINGS.inner_m)
 
 
-def test_a_tight_shell_shows_the_same_picture():
+def test_a_tightened_shell_renders_the_same_image():
     bodies, conditions = standing()
     field = field_of(1000.0)
     rays = from_above((0.5, 0.4, 3.0), (0.31, 0.62, 3.0), (0.1, 0.8, 3.0))
@@ -89,8 +91,8 @@ def test_a_tight_shell_shows_the_same_picture():
     assert (before > 0.95).all()
 
 
-def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
-    """The middle one of three rays passes 1 m beside the box; the results of the others do not depend on it."""
+def test_rays_that_miss_the_shell_are_empty_and_do_not_affect_others():
+    """The middle one of three rays passes 1 m from the box; the results of the others do not depend on it."""
     bodies, conditions = standing()
     field = field_of(100.0)
     rays = from_above((0.5, 0.5, 3.0), (2.0, 0.5, 3.0), (0.4, 0.6, 3.0))
@@ -111,8 +113,8 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
         torch.testing.assert_close(all_three[[0, 2]], alone, atol=1e-6, rtol=0)
 
 
-def test_beyond_its_thickness_the_shell_sees_nothing():
-    """Cells of 5 cm put samples 7 cm and more above the box; those beyond 2 cm are out of reach."""
+def test_samples_beyond_the_shell_thickness_are_out_of_reach():
+    """Cells of 5 cm put samples 7 cm and more above the box; those above 2 cm are out of reach."""
     bodies, conditions = standing()
     field = field_of(100.0)
     field.outer_m.fill_(0.02)
@@ -126,13 +128,13 @@ def test_beyond_its_thickness_the_shell_sees_nothing():
 
 
 def test_pixels_within_the_shell_and_a_cell_are_visible():
-    """7 cm and a cell of 5 cm at 210 m, with 5000 px focal length, are 2.9 px, rounded up."""
+    """The shell of 7 cm and a cell of 5 cm, at 210 m with a focal length of 5000 px, are 2.9 px, rounded up."""
     camera = Camera("afar", np.diag([5000.0, 5000.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
     seen = field_of(100.0).visible_pixels(camera, 210 * np.array([[20 / 5000, 20 / 5000, 1.0]]))
     assert np.flatnonzero(seen[20]).tolist() == [*range(17, 24)]
 
 
-def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monkeypatch: pytest.MonkeyPatch):
+def test_adaptive_sample_counts_render_the_same_as_many_samples(monkeypatch: pytest.MonkeyPatch):
     """Straight and slanted rays with different path lengths in the shell, and one that misses it, agree with 32 samples
     each."""
     bodies, conditions = standing()
@@ -160,10 +162,10 @@ def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> Fast
     return field
 
 
-def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
-    """The surface lies 10 cm inside the body, the shell is 3 cm deep, so no sample sees the surface. A ray through the
-    middle is opaque all the same, at its last sample and in that sample's colour; a ray that grazes the shell sees
-    nothing."""
+def test_rendered_rays_end_at_the_solid_core_if_the_surface_lies_deeper():
+    """The surface lies 10 cm inside the body and the shell is 3 cm deep, so no sample reaches the surface. A ray
+    through the middle is opaque nevertheless, at its last sample and with that sample's colour. A ray that grazes the
+    shell sees nothing."""
     bodies, conditions = standing()
     field = deeper_by(0.1)
     rays = from_above((0.5, 0.5, 3.0), (-0.05, 0.5, 3.0))
@@ -179,9 +181,9 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
     assert samples.colour[0, -1].min() > 0 and seen[1, 3] < 0.01
 
 
-def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
-    """The shell reaches 3 cm out and 10 cm in; the surface lies 7 cm inside the body, farther from the skin than the
-    outer thickness."""
+def test_a_shell_with_more_depth_than_height_finds_a_deep_surface():
+    """The shell extends 3 cm outwards and 10 cm inwards. The surface lies 7 cm inside the body, farther from the skin
+    than the outer thickness."""
     settings = SETTINGS.model_copy(update={"outer_m": 0.03, "inner_m": 0.1, "shell_cell_m": 0.015})
     bodies, conditions = standing()
     field = deeper_by(0.07, settings)
@@ -192,8 +194,8 @@ def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
     assert seen[3] == pytest.approx(1, abs=0.01) and seen[4].item() - top_m == pytest.approx(0.07, abs=0.01)
 
 
-def test_rays_beside_others_see_what_they_would_see_alone():
-    """A hundredth of a radian beside two rays onto a flat face, whose own colours differ."""
+def test_neighbouring_rays_are_rendered_as_if_alone():
+    """The rays are a hundredth of a radian off two rays that hit a flat face; colours differ between them."""
     bodies, conditions = standing()
     field = field_of(2000.0)
     torch.nn.init.normal_(field.field.colour_grids.features, std=30.0)
@@ -213,14 +215,15 @@ def test_rays_beside_others_see_what_they_would_see_alone():
     assert found[..., 3].min() > 0.99 and (found[..., :3] - between[:, :3]).abs().max() > 0.02
 
 
-def test_samples_of_little_weight_take_the_colour_of_their_ray() -> None:
-    """Shown are samples of more than a hundredth, or than half the greatest on a ray that sees hardly anything."""
+def test_only_samples_of_some_weight_are_coloured() -> None:
+    """These are samples with a weight above 0.01, or above half of the largest on a ray that is nearly empty."""
     weights = torch.tensor([[0.02, 0.009, 0.9, 0.011], [0.004, 0.001, 0.003, 0.0]])
     assert shown(weights).tolist() == [[True, False, True, True], [True, False, True, False]]
 
 
-def test_all_that_a_ray_sees_is_coloured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A surface so soft that many samples weigh little: they are white, as the others are, and not black."""
+def test_samples_of_low_weight_do_not_darken_the_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The surface is so soft that many samples have a low weight. They count as white, like the others, not as
+    black."""
     bodies, conditions = standing()
     field = field_of(40.0)
     monkeypatch.setattr(type(field.field), "colour", lambda _, y, *__: torch.ones_like(y))
@@ -232,9 +235,9 @@ def test_all_that_a_ray_sees_is_coloured(monkeypatch: pytest.MonkeyPatch) -> Non
     torch.testing.assert_close(seen[:3], seen[3].expand(3))
 
 
-def test_the_shell_moves_with_the_surface_of_a_frame():
-    """For a frame displaced by 2 cm the shell is 2 cm higher; for one displaced by 6 cm its upper end stops at the
-    setting of 7 cm, 5 cm above where it was."""
+def test_the_shell_moves_with_the_displacement_of_a_frame():
+    """For a frame displaced by 2 cm, the shell is 2 cm higher. For one displaced by 6 cm, its upper end stops at the
+    setting of 7 cm, which is 5 cm higher."""
     settings = SETTINGS.model_copy(update={"nodes": 1, "shell_cell_m": 0.01, "inner_m": 0.1})
     field = FastField(RIG, settings, 2)
     assert field.deformation is not None
@@ -257,22 +260,23 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
     torch.testing.assert_close(still - ends(1), torch.tensor([0.05, 0.06]), atol=0.011, rtol=0)
 
 
-def test_training_begins_with_half_the_samples():
-    """With 32 samples, three quarters of the steps use 16, the rest all; rendering uses what a ray needs."""
+def test_training_starts_with_half_the_samples():
+    """Of 32 samples, three quarters of the steps use 16, the rest all. Rendering uses as many as a ray needs."""
     field = FastField(RIG, SETTINGS, 1)
     assert [field.training_samples(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
 
 
 def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
-    """Return descriptors of one ray's samples at given heights above the skin z = 0, which it meets perpendicularly."""
+    """Return descriptors of the samples of one ray that meets the skin z = 0 perpendicularly, at given heights above
+    it."""
     d, zero = torch.tensor(depth_m), torch.zeros(len(depth_m))
     y = torch.stack([zero, zero, d], 1)
     return Descriptor(d, y, y, torch.tensor(near), torch.zeros(len(d), 3).long(), torch.zeros(len(d), 3))
 
 
-def test_colours_are_those_of_the_surface_between_two_samples():
-    """Samples at 12, 6, -2, -8 mm above the skin, the surface at 1 mm: the second sample moves 5 / 8 of the way to the
-    third, the first moves to the second; those behind the surface stay."""
+def test_samples_in_front_of_the_surface_move_onto_it():
+    """Samples lie at 12, 6, -2 and -8 mm above the skin, the surface at 1 mm. The second sample moves 5 / 8 of the way
+    to the third, and the first moves to the second. Those behind the surface stay."""
     described = on_a_ray([0.012, 0.006, -0.002, -0.008], [True] * 4)
     moved = move_to_surface(described, described.d[None] - 0.001)
     expected = torch.tensor([0.006, 0.001, -0.002, -0.008])
@@ -280,7 +284,7 @@ def test_colours_are_those_of_the_surface_between_two_samples():
     assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
 
 
-def test_samples_stay_where_the_next_one_is_out_of_reach_or_farther_from_another_limb():
+def test_samples_stay_if_the_next_is_out_of_reach_or_near_another_limb():
     described = on_a_ray([0.005, -0.005, 0.005, 0.006], [True, False, True, True])
     described.y[3, 0] = 0.1
     moved = move_to_surface(described, described.d[None])
@@ -289,9 +293,10 @@ def test_samples_stay_where_the_next_one_is_out_of_reach_or_farther_from_another
 
 
 @pytest.mark.parametrize("first_near", [True, False])
-def test_a_sample_before_another_limb_shows_that_limb(first_near):
-    """5 mm from an arm, or out of reach, then 1 and 6 mm inside the trunk: the path between the first two is opaque by
-    the trunk, whose surface is a fifth of a step before the second."""
+def test_a_sample_in_front_of_another_limb_moves_onto_that_limb(first_near):
+    """The first sample is 5 mm from an arm, or out of reach; the next two are 1 and 6 mm inside the trunk. The path
+    between the first two is opaque because of the trunk, whose surface is a fifth of a step before the second
+    sample."""
     described = on_a_ray([0.005, -0.001, -0.006], [first_near, True, True])
     described.y[1:, 0] = 0.1
     described.corners[1:], described.barycentric[1:] = 7, 0.5
@@ -303,9 +308,9 @@ def test_a_sample_before_another_limb_shows_that_limb(first_near):
         assert torch.equal(getattr(moved, name), getattr(described, name)[[1, 1, 2]])
 
 
-def test_a_ray_comes_closest_to_a_limb_between_samples():
-    """(t^2 + 2) mm at t = -1.75, -0.75, 0.25, 1.25 steps: the least is 2 mm. Not so at the ends, where neighbours are
-    out of reach, or on another limb."""
+def test_the_least_distance_along_a_ray_is_interpolated_between_samples():
+    """The distance is (t^2 + 2) mm at t = -1.75, -0.75, 0.25 and 1.25 steps, so the least is 2 mm. It is not
+    interpolated at the ends, nor if a neighbour is out of reach or on another limb."""
     d_hat = 1e-3 * (torch.tensor([[-1.75, -0.75, 0.25, 1.25]]).square() + 2)
     described = on_a_ray(d_hat[0].tolist(), [True] * 4)
     expected = d_hat.clone()
@@ -318,10 +323,10 @@ def test_a_ray_comes_closest_to_a_limb_between_samples():
         assert torch.equal(least_around(on_a_ray([0.01] * few, [True] * few), d_hat[:, :few]), d_hat[:, :few])
 
 
-def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
-    """A ray falls at 45 degrees, 4 mm down and 4 mm along x a sample, from 3 mm above the skin at x = 0 to 1 mm below:
-    it meets it at x = 3 mm. The body moved along the ray by e shows the same point; moved down by e, the ray meets it e
-    later in x."""
+def test_the_surface_point_moves_correctly_with_its_body():
+    """A ray descends at 45 degrees, 4 mm down and 4 mm along x per sample, from 3 mm above the skin at x = 0 to 1 mm
+    below. It hits the skin at x = 3 mm. If the body moves along the ray by e, the ray hits the same point of it; if the
+    body moves down by e, the ray hits it e farther along x."""
     x, height = torch.tensor([[0.0, 0.004], [0.003, -0.001]], dtype=torch.double)
 
     def met_at(points_on_rays: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
@@ -339,8 +344,8 @@ def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
     assert torch.autograd.gradcheck(met_at, (still, still), eps=1e-7)
 
 
-def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
-    """Gradients of a slanted ray's colour to the body's position are its central differences over 0.2 mm."""
+def test_colour_gradients_by_the_body_position_match_finite_differences():
+    """The gradients of a slanted ray's colour match central differences over 0.2 mm."""
     bodies, conditions = standing()
     field, correction = field_of(500.0), bodies.correction()
     for grid in field.field.colour_grids.parameters():
@@ -370,20 +375,21 @@ def test_a_ray_that_grazes_the_surface_has_finite_gradients():
     assert torch.isfinite(d_hat.grad).all()
 
 
-def test_samples_stay_where_the_surface_is_left():
+def test_samples_stay_if_the_ray_moves_away_from_the_surface():
     described = on_a_ray([0.001, 0.004, 0.004, 0.009], [True] * 4)
     assert torch.equal(move_to_surface(described, described.d[None]).d, described.d)
 
 
-def test_the_person_is_the_union_of_the_limbs() -> None:
-    """Point 0 is asked about two more limbs, of which the last is the least; 1 is deepest in its own; 2 in another."""
+def test_the_distance_is_the_minimum_over_limbs() -> None:
+    """Point 0 is queried for two more limbs, and the last one has the least distance. Point 1 is deepest in its own
+    limb, point 2 in another one."""
     d_hat = torch.tensor([3.0, -4.0, 2.0, 2.5, 1.0, -3.0, -1.0])
     assert least_of_limbs(d_hat, torch.tensor([0, 0, 1, 2])).tolist() == [4, 1, 6]
 
 
-def test_a_shirt_that_is_closer_to_the_arm_than_to_the_trunk_is_the_trunks() -> None:
-    """The arm is 4 cm from the trunk, 0.8 m below the shoulder, and a shirt reaches 3 cm out of the trunk. 2.5 cm from
-    the trunk, less than 1.5 from the arm, a point is 5 mm inside the shirt, and a ray through it ends there."""
+def test_a_trunks_shirt_is_found_even_at_points_closer_to_the_arm() -> None:
+    """At 0.8 m below the shoulder, the arm is 4 cm from the trunk, and a shirt extends 3 cm from the trunk. A point 2.5
+    cm from the trunk is less than 1.5 cm from the arm, but 5 mm inside the shirt, and a ray through it ends there."""
     rig, bodies = limbs_rig(), swung(0.2)
     field = FastField(rig, SETTINGS, 1)
     field.log_sharpness.data.fill_(2000.0).log_()

@@ -1,8 +1,9 @@
-"""One ray through the fast field with known functions in place of its networks: the inputs of the networks, and the
-slope of the resulting distance.
+"""One ray through the fast field with known functions instead of its networks: the networks' inputs, and the slope of
+the resulting distance.
 
-The body is the unit box, turned by a quarter about z: the ray comes along x and meets its face at x = 1.55 m, where the
-canonical position is (0.4, 1, 0.25) and the canonical normal is y. The shell reaches 6 cm out and 4 cm in.
+The body is the unit box, turned by a quarter about z. The ray runs along x and hits the box's face at x = 1.55 m, where
+the canonical position is (0.4, 1, 0.25) and the canonical normal is y. The shell extends 6 cm outwards and 4 cm
+inwards.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from hnerf.fields.samples import RaySamples
 from tests.body.boxes import box_rig
 
 RIG = box_rig()
-FINE_RIG = box_rig(splits=2)  # of whose vertices those around the ray have the face's normal
+FINE_RIG = box_rig(splits=2)  # whose vertices around the ray have the face's normal
 THETA = torch.tensor([[[0.0, 0, 0], [-0.4, 0.5, 0.6]], [[0.0, 0, 0], [0.1, 0.2, 0.3]]])
 ROOT = torch.eye(4).repeat(2, 1, 1)
 ROOT[1, :2] = torch.tensor([[0.0, -1, 0, 2.55], [1, 0, 0, 0]])
@@ -30,20 +31,20 @@ SETTINGS = FastFieldSettings(
     outer_m=0.06, inner_m=0.04, shell_cell_m=0.02, samples=12, geometry_cells=(2,), colour_cells=(2,), pose_width=1
 )
 RAY = Rays(torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1]))
-OUTERMOST, INNERMOST = 0.3, 0.99  # of the ray's samples
+OUTERMOST, INNERMOST = 0.3, 0.99  # fractions of the ray's samples
 
 Distance = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 def field_of(residual: Distance, nodes: int = 0, rig: Rig = RIG) -> FastField:
-    """Return a field with a sharp surface and the given DH."""
+    """Return a field with a sharp surface and the given function as DH."""
     field = FastField(rig, SETTINGS.model_copy(update={"nodes": nodes}), 2)
     field.log_sharpness.data.fill_(2000.0).log_()
     field.field.residual = residual
     return field
 
 
-def nothing(y_m: Tensor, d_m: Tensor, pose: Tensor, row: Tensor) -> Tensor:
+def no_residual(y_m: Tensor, d_m: Tensor, pose: Tensor, row: Tensor) -> Tensor:
     return torch.zeros_like(d_m)
 
 
@@ -57,12 +58,12 @@ def sampled(field: FastField, probe: float | None = None, rig: Rig = RIG) -> Ray
     return field.sample(scene, RAY, draws)[0]
 
 
-def same(found: Tensor, expected: list[float]) -> None:
+def expect_close(found: Tensor, expected: list[float]) -> None:
     torch.testing.assert_close(found.detach(), torch.tensor(expected), atol=1e-4, rtol=0)
 
 
-def test_the_networks_see_the_canonical_place_the_frames_pose_and_the_normal_in_the_world() -> None:
-    """The surface lies 1 cm outside the body. F is evaluated where the ray meets it, DH at every sample."""
+def test_network_inputs_are_canonical_position_pose_and_world_normal() -> None:
+    """The surface lies 1 cm outside the body. F is evaluated where the ray hits it, DH at every sample."""
     asked: dict[str, tuple[Tensor, ...]] = {}
 
     def residual(*inputs: Tensor) -> Tensor:
@@ -78,61 +79,62 @@ def test_the_networks_see_the_canonical_place_the_frames_pose_and_the_normal_in_
     samples = sampled(field, rig=FINE_RIG)
     place, depth, normal, pose, row = asked["colour"]
     at = int((depth - 0.01).abs().argmin())
-    same(place[at], [0.4, 1.01, 0.25])
-    same(depth[at], 0.01)
-    same(normal[at], [-1.0, 0, 0])
-    same(pose[row[at]], [0.1, 0.2, 0.3])
+    expect_close(place[at], [0.4, 1.01, 0.25])
+    expect_close(depth[at], 0.01)
+    expect_close(normal[at], [-1.0, 0, 0])
+    expect_close(pose[row[at]], [0.1, 0.2, 0.3])
     place, depth, pose, row = asked["residual"]
     assert torch.equal(depth.detach(), samples.d[0, -len(depth) :]) and (depth.diff() < 0).all()
-    same(place[:, 1], (1 + depth).tolist())
-    same(pose[row], [[0.1, 0.2, 0.3]] * len(depth))
-    same(samples.colour[0, weights_from_alpha(samples.alpha)[0].argmax()], [0.4, 1.01, 0.25])
-    same(samples.residual, [[0.0] * (12 - len(depth)) + [-0.01] * len(depth)])  # the first lie beyond the shell
+    expect_close(place[:, 1], (1 + depth).tolist())
+    expect_close(pose[row], [[0.1, 0.2, 0.3]] * len(depth))
+    expect_close(samples.colour[0, weights_from_alpha(samples.alpha)[0].argmax()], [0.4, 1.01, 0.25])
+    expect_close(samples.residual, [[0.0] * (12 - len(depth)) + [-0.01] * len(depth)])  # the first are off the shell
 
 
-def test_light_falls_on_the_surface_not_on_the_body() -> None:
-    """The distance rises by 1.5 along y and by 0.3 along x of the rest body, which are -x and y of the world; what the
-    colour's loss asks of the normal reaches the network of the distance."""
+def test_the_normal_is_that_of_the_surface_not_of_the_body() -> None:
+    """The distance rises by 1.5 along y and by 0.3 along x of the rest body, which are -x and y of the world. Gradients
+    of a colour loss by the normal reach the distance network."""
     slope, normals = torch.tensor(0.5, requires_grad=True), []
     field = field_of(lambda y, d, pose, row: slope * (y[:, 1] - 1) + 0.3 * (y[:, 0] - 0.4), rig=FINE_RIG)
     field.field.colour = lambda y, d, normal, pose, row: normals.append(normal) or normal
     sampled(field, rig=FINE_RIG)
-    same(normals[0], [[-1.5 / 2.34**0.5, 0.3 / 2.34**0.5, 0.0]] * len(normals[0]))
+    expect_close(normals[0], [[-1.5 / 2.34**0.5, 0.3 / 2.34**0.5, 0.0]] * len(normals[0]))
     assert torch.autograd.grad(normals[0][0, 0], slope)[0].item() == pytest.approx(-0.09 / 2.34**1.5, abs=1e-4)
 
 
 @pytest.mark.parametrize("probe", [OUTERMOST, INNERMOST])
-def test_the_distance_is_as_steep_as_in_the_world(probe: float) -> None:
-    """Along the normal it rises by 1 per metre for the body, and by 0.5 and 0.2 for the residual's second coordinate
-    and distance; across it by 0.3; the same outside the skin and inside."""
+def test_the_gradient_norm_is_per_metre_of_the_world(probe: float) -> None:
+    """Along the normal, the distance rises by 1 per metre because of the body, and by 0.5 and 0.2 because of the
+    residual's second coordinate and distance. Across the normal it rises by 0.3. This holds outside the skin and
+    inside."""
     samples = sampled(field_of(lambda y, d, pose, row: 0.3 * y[:, 0] + 0.5 * y[:, 1] + 0.2 * d), probe)
     assert (samples.d[0, int(12 * probe)] > 0.01) == (probe == OUTERMOST)
-    same(samples.gradient_norm, [(1.7**2 + 0.3**2) ** 0.5])
+    expect_close(samples.gradient_norm, [(1.7**2 + 0.3**2) ** 0.5])
 
 
 def test_the_gradient_is_a_forward_difference_over_5_mm() -> None:
     """The gradient of 40 (y - 1)^2, where y - 1 is d, is 80 d + 40 x 0.005."""
     samples = sampled(field_of(lambda y, d, pose, row: 40 * (y[:, 1] - 1) ** 2), OUTERMOST)
-    same(samples.gradient_norm, [1 + 80 * samples.d[0, int(12 * OUTERMOST)].item() + 0.2])
+    expect_close(samples.gradient_norm, [1 + 80 * samples.d[0, int(12 * OUTERMOST)].item() + 0.2])
 
 
-def test_the_eikonal_loss_moves_no_body() -> None:
-    """Its gradients flow to the field alone; rendering does not compute it."""
+def test_the_eikonal_loss_has_no_gradient_by_the_body() -> None:
+    """Its gradients flow only to the field. Rendering does not compute it."""
     assert not sampled(field_of(lambda y, d, pose, row: y[:, 0] * d), OUTERMOST).gradient_norm.requires_grad
-    assert sampled(field_of(nothing)).gradient_norm.shape == (0,)
+    assert sampled(field_of(no_residual)).gradient_norm.shape == (0,)
 
 
-def test_the_energy_of_a_displacement() -> None:
-    """A displacement by 2 cm along y in the ray's frame, in units of 1 cm, has energy 4 at each sample. The ray meets
+def test_the_elastic_energy_of_a_displacement() -> None:
+    """A displacement by 2 cm along y in the ray's frame, in units of 1 cm, has energy 4 at each sample. The ray hits
     the body's surface 2 cm earlier."""
-    field = field_of(nothing, nodes=1)
+    field = field_of(no_residual, nodes=1)
     assert field.deformation is not None
     still = sampled(field)
     assert still.elastic is not None
-    same(still.elastic, [0.0])
+    expect_close(still.elastic, [0.0])
     field.deformation.displacement.data[1, 0, 1] = 0.02
     field.outer_m.fill_(0.03)
     moved = sampled(field)
     assert moved.elastic is not None
-    same(moved.elastic, [4.0])
+    expect_close(moved.elastic, [4.0])
     assert moved.d.min() < 0 < moved.d.max() < 0.06

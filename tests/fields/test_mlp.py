@@ -3,8 +3,8 @@ import torch
 from hnerf.fields.mlp import RadianceMLP, ResidualMLP, SkipMLP
 
 
-def test_sizes_of_the_paper():
-    """F has eight layers of 256, the fifth with the input again; DH has six of 128."""
+def test_networks_have_the_papers_sizes():
+    """F has eight layers of 256, and its fifth layer takes the input again; DH has six layers of 128."""
     radiance = RadianceMLP(4, 57, 12)
     inputs = 4 * 17 + 57
     assert [layer.in_features for layer in radiance.trunk.layers] == [
@@ -23,7 +23,7 @@ def test_sizes_of_the_paper():
     assert [layer.in_features for layer in residual.trunk.layers] == [inputs, 128, 128, 128 + inputs, 128, 128]
 
 
-def test_density_does_not_see_root_or_view():
+def test_density_is_independent_of_root_and_view():
     network = RadianceMLP(4, 3, 12)
     point, pose = torch.rand(5, 4), torch.rand(5, 3)
     one = network(point, pose, torch.zeros(5, 12), torch.zeros(5, 3))
@@ -32,7 +32,7 @@ def test_density_does_not_see_root_or_view():
     assert not torch.equal(one[1], two[1])
 
 
-def test_density_colour_and_distance_see_the_pose():
+def test_density_colour_and_distance_depend_on_the_pose():
     radiance, residual = RadianceMLP(4, 3, 12), ResidualMLP(4, 3)
     torch.nn.init.normal_(residual.residual.weight)
     point, root, view = torch.rand(5, 4), torch.rand(5, 12), torch.rand(5, 3)
@@ -41,7 +41,7 @@ def test_density_colour_and_distance_see_the_pose():
     assert not any(torch.equal(here, there) for here, there in zip(one, two, strict=True))
 
 
-def test_residual_starts_at_zero():
+def test_the_residual_network_starts_at_zero():
     assert ResidualMLP(4, 3)(torch.rand(5, 4), torch.rand(5, 3)).abs().max() == 0
 
 
@@ -52,8 +52,8 @@ def test_gradients_in_double():
 
 
 def slopes(network: SkipMLP, points: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Return values, their gradients by the points, and the gradients of a loss on either by the parameters, as
-    `eikonal` needs."""
+    """Return values, their gradients by the points, and the gradients by the parameters of a loss on both, as `eikonal`
+    needs them."""
     points = points.clone().requires_grad_()
     values = network(points).float()
     (slope,) = torch.autograd.grad(values.sum(), points, create_graph=True)
@@ -61,8 +61,9 @@ def slopes(network: SkipMLP, points: torch.Tensor) -> tuple[torch.Tensor, ...]:
     return values, slope, *torch.autograd.grad(loss, list(network.parameters()))
 
 
-def test_products_in_bfloat16_are_wrong_by_a_few_percent_at_most():
-    """Eight bits of a mantissa, 0.4 %, in each of eight layers; what is kept for gradients is in bfloat16, too."""
+def test_bfloat16_products_have_errors_of_at_most_a_few_percent():
+    """A mantissa of eight bits has an error of 0.4 % in each of eight layers. Tensors saved for gradients are in
+    bfloat16 too."""
     torch.manual_seed(0)
     network, points, saved = SkipMLP(30, 256, 8), torch.randn(1000, 30), []  # not a multiple of 8
     for layer in network.layers:
@@ -85,8 +86,8 @@ def test_products_in_bfloat16_are_wrong_by_a_few_percent_at_most():
         assert 1e-3 < (found - exact).norm() / exact.norm() < 0.03
 
 
-def test_radiance_in_bfloat16_is_that_in_single_precision_but_for_rounding():
-    """Density and colour leave in single precision; the colour's hidden layer multiplies in bfloat16, too."""
+def test_radiance_in_bfloat16_matches_single_precision_up_to_rounding():
+    """Density and colour are returned in single precision; the colour's hidden layer multiplies in bfloat16 too."""
     torch.manual_seed(0)
     exact, reduced = RadianceMLP(4, 57, 12), RadianceMLP(4, 57, 12, bf16=True)
     reduced.load_state_dict(exact.state_dict())
@@ -96,16 +97,16 @@ def test_radiance_in_bfloat16_is_that_in_single_precision_but_for_rounding():
         assert 1e-4 < (two - one).norm() / one.norm() < 0.03
 
 
-def test_density_differs_over_space_from_the_start():
-    """With torch's own initial weights its standard deviation is below 0.001."""
+def test_initial_density_varies_over_space():
+    """With torch's default initial weights, its standard deviation would be below 0.001."""
     torch.manual_seed(0)
     network = RadianceMLP(4, 57, 12)
     density, _ = network(2 * torch.rand(500, 4) - 1, torch.zeros(500, 57), torch.zeros(500, 12), torch.zeros(500, 3))
     assert density.std() > 0.01
 
 
-def test_views_are_encoded_where_asked():
-    """(v, sin pi v, cos pi v) are nine inputs instead of three; a view of 1 differs from one of -1 in v alone."""
+def test_view_directions_are_encoded_if_octaves_are_set():
+    """(v, sin pi v, cos pi v) are nine inputs instead of three. Views of 1 and -1 differ only in v."""
     network = RadianceMLP(4, 3, 12, view_octaves=1)
     assert network.colour[0].in_features == 256 + 12 + 9
     with torch.no_grad():

@@ -1,10 +1,11 @@
-"""One ray through the published field with known functions in place of its networks: the inputs of the networks, and
-what their outputs become.
+"""One ray through the published field with known functions instead of its networks: the networks' inputs, and the
+results of their outputs.
 
-A scene unit is 2 m. The body is the unit box, turned by a quarter about z: it lies between x = 1.55 and 2.55 m, its box
-B between 1.45 and 2.65. The ray comes along x from 1 m before the scene, so x is its depth less 1 m. A fog halves the
-light per metre: four coarse samples in the middles of their metres have weights 1/2, 1/4, 1/8 and 1/8, and fine samples
-at .6 of the quarters of these lie at 1.3 and 1.8 m in the first metre, 2.6 m in the second and 4.2 m in the last.
+A scene unit is 2 m. The body is the unit box, turned by a quarter about z: it lies between x = 1.55 and 2.55 m, and its
+box B between 1.45 and 2.65 m. The ray runs along x and starts 1 m before the scene, so x is its depth minus 1 m. A fog
+halves the light per metre. Four coarse samples in the middles of their metres have weights 1/2, 1/4, 1/8 and 1/8. Fine
+samples at .6 of the quarters of these lie at 1.3 and 1.8 m in the first metre, 2.6 m in the second and 4.2 m in the
+last.
 """
 
 import math
@@ -28,17 +29,17 @@ from tests.body.boxes import box_rig
 RIG = box_rig()
 THETA = torch.tensor([[[0.0, 0, 0], [-0.4, 0.5, 0.6]], [[0.0, 0, 0], [0.1, 0.2, 0.3]]])
 ROOT = torch.eye(4).repeat(2, 1, 1)
-ROOT[0, :3, 3] = torch.tensor([1.45, 0.4, -1.0])  # so that the middle of the scene is (2, 0.2, -0.5)
+ROOT[0, :3, 3] = torch.tensor([1.45, 0.4, -1.0])  # so that the centre of the scene is (2, 0.2, -0.5)
 ROOT[1, :2] = torch.tensor([[0.0, -1, 0, 2.55], [1, 0, 0, 0]])
 SETTINGS = PaperFieldSettings(scene_m=2.0, samples=4)
 RAY = Rays(torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1]))
 DRAWS = Draws(torch.full((1, 4), 0.5), torch.ones(1, 3), torch.full((1, 4), 0.6), probe=torch.zeros(1))
 
 DEPTHS_M = [1.3, 1.5, 1.8, 2.5, 2.6, 3.5, 4.2, 4.5]
-INSIDE = torch.tensor([0.0, 0, 0, 1, 1, 1, 0, 0])  # B, 5 cm before the body's face, 5 cm behind it and before the other
+INSIDE = torch.tensor([0.0, 0, 0, 1, 1, 1, 0, 0])  # in B: 5 cm before the body, 5 cm inside at either face
 X = [-0.85, -0.75, -0.6, -0.25, -0.2, 0.25, 0.6, 0.75]  # in scene units
 S_D = [[0.2, 0.5, 0.125, 0.025], [0.2, 0.5, 0.125, -0.025], [0.2, 0.0, 0.125, -0.025]]
-TURN = [0.0, -1, 0, 0.275, 1, 0, 0, -0.1, 0, 0, 1, 0.25]  # the rows of T; from the middle of the scene, in its units
+TURN = [0.0, -1, 0, 0.275, 1, 0, 0, -0.1, 0, 0, 1, 0.25]  # the rows of T, relative to the scene's centre in scene units
 
 
 class Fog(nn.Module):
@@ -47,7 +48,7 @@ class Fog(nn.Module):
     def __init__(self, paint: Callable[[Tensor], Tensor] = lambda point: point[:, :3]):
         super().__init__()
         self.paint, self.asked = paint, []
-        self.density = nn.Parameter(torch.tensor(2 * math.log(2)))  # a scene unit, which is two metres
+        self.density = nn.Parameter(torch.tensor(2 * math.log(2)))  # per scene unit, which is two metres
 
     def forward(self, point: Tensor, pose: Tensor, root: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
         self.asked.append((point.detach(), pose, root, view))
@@ -85,31 +86,31 @@ def rows(values: list[list[float]]) -> Tensor:
 
 
 def outside(dimensions: int) -> Tensor:
-    """Return the ray's points in scene units, with the constant distance outside B where there are four dimensions."""
+    """Return the ray's points in scene units; with four dimensions, the last is the constant distance outside B."""
     return rows([[x, 0.1, 0.375, 1.0][:dimensions] for x in X])
 
 
-def same(found: Tensor, expected: Tensor, atol: float = 2e-4) -> None:
-    """Compare with a tolerance of 0.1 mm: fine samples deviate because no cell has zero weight."""
+def expect_close(found: Tensor, expected: Tensor, atol: float = 2e-4) -> None:
+    """Assert equality with a tolerance of 0.1 mm: fine samples deviate because no cell has zero weight."""
     torch.testing.assert_close(found.detach(), expected, atol=atol, rtol=0)
 
 
 @pytest.mark.parametrize("static", [False, True])
-def test_fine_samples_lie_where_the_coarse_ones_have_weight(static: bool) -> None:
+def test_fine_samples_follow_the_weights_of_the_coarse_ones(static: bool) -> None:
     _, depths = sampled(field_of(static))
-    same(depths, rows([DEPTHS_M]))
-    assert not depths.requires_grad  # no gradient moves them
+    expect_close(depths, rows([DEPTHS_M]))
+    assert not depths.requires_grad  # no gradient flows to depths
 
 
-def test_some_coarse_samples_lie_in_the_box_alone() -> None:
-    """Two of four samples lie in the middles of the scene's halves, at 2 and 4 m, two in those of B, which the ray
-    crosses from 2.45 to 3.65 m."""
+def test_box_samples_lie_only_in_the_box() -> None:
+    """Of four samples, two lie in the middles of the scene's halves, at 2 and 4 m, and two in the middles of the halves
+    of B, which the ray crosses from 2.45 to 3.65 m."""
     field = field_of(static=True, box_samples=2)
     sampled(field)
-    same(field.radiance.asked[0][0][:, 0], torch.tensor([-0.5, -0.125, 0.175, 0.5]))
+    expect_close(field.radiance.asked[0][0][:, 0], torch.tensor([-0.5, -0.125, 0.175, 0.5]))
 
 
-def test_a_ray_beside_the_box_has_all_its_samples_in_the_scene() -> None:
+def test_a_ray_that_misses_the_box_has_all_its_samples_in_the_scene() -> None:
     field = field_of(static=True, box_samples=2)
     beside = replace(RAY, origins_m=torch.tensor([[-1.0, 1.9, 0.25]]))
     samples, depths = field.sample(field.scene(*bodies()), beside, DRAWS)
@@ -118,10 +119,10 @@ def test_a_ray_beside_the_box_has_all_its_samples_in_the_scene() -> None:
 
 
 @pytest.mark.parametrize("walk_m", [6.0, -6.0])
-def test_a_person_who_walks_out_of_the_scene_is_sampled(walk_m: float) -> None:
-    """The first of two bodies stands at y = 0, the second at 6 or -6 m, and the scene's 2 m around their middle end
-    before either. A ray along x through the second is in the scene from -2 to 2 m; coarse samples lie at -1.5, -.5, .5
-    and 1.5 m, of which the third is in B, from -.1 to 1.1 m."""
+def test_a_person_outside_the_scene_is_sampled(walk_m: float) -> None:
+    """The first of two bodies stands at y = 0, the second at 6 or -6 m, and the scene of 2 m around their centre
+    contains neither. A ray along x through the second body is in the scene from -2 to 2 m. Coarse samples lie at -1.5,
+    -.5, .5 and 1.5 m, of which the third is in B, from -.1 to 1.1 m."""
     root = torch.eye(4).repeat(2, 1, 1)
     root[1, 1, 3] = walk_m
     field = PaperField(RIG, root, SETTINGS, static=False)
@@ -136,75 +137,75 @@ def test_a_person_who_walks_out_of_the_scene_is_sampled(walk_m: float) -> None:
     assert (field.radiance.asked[0][0][:, 3] != 1).tolist() == [False, False, True, False]
 
 
-def test_coarse_samples_are_asked_first() -> None:
+def test_coarse_samples_are_evaluated_before_all_samples() -> None:
     field = field_of()
     sampled(field)
     (coarse, *_), (both, *_) = field.radiance.asked
-    same(coarse, rows([outside(4)[1].tolist(), S_D[0], S_D[2], outside(4)[7].tolist()]))
+    expect_close(coarse, rows([outside(4)[1].tolist(), S_D[0], S_D[2], outside(4)[7].tolist()]))
     assert len(both) == 8
 
 
-def test_f_sees_the_body_in_its_box_and_the_place_with_a_constant_outside() -> None:
+def test_inputs_of_f_inside_and_outside_the_box() -> None:
     """Inside: (s, d) in scene units, with pose and root of the ray's frame. Outside: x - centre in scene units,
     distance 1, and zeros."""
     field = field_of()
     sampled(field)
     point, pose, root, view = field.radiance.asked[-1]
-    same(point, torch.cat([outside(4)[:3], rows(S_D), outside(4)[6:]]))
-    same(pose, INSIDE[:, None] * torch.tensor([0.1, 0.2, 0.3]))
-    same(root, INSIDE[:, None] * torch.tensor(TURN))
-    same(view, rows([[1.0, 0, 0]] * 8))
+    expect_close(point, torch.cat([outside(4)[:3], rows(S_D), outside(4)[6:]]))
+    expect_close(pose, INSIDE[:, None] * torch.tensor([0.1, 0.2, 0.3]))
+    expect_close(root, INSIDE[:, None] * torch.tensor(TURN))
+    expect_close(view, rows([[1.0, 0, 0]] * 8))
 
 
-def test_dh_sees_the_body_and_the_pose() -> None:
+def test_inputs_of_dh_are_the_descriptor_and_the_pose() -> None:
     field = field_of()
     sampled(field)
     point, pose = field.residual.asked[-1]
-    same(point, rows(S_D))
-    same(pose, rows([[0.1, 0.2, 0.3]] * 3))
+    expect_close(point, rows(S_D))
+    expect_close(pose, rows([[0.1, 0.2, 0.3]] * 3))
 
 
-def test_the_networks_see_the_noise() -> None:
-    """There is noise on theta and T within B, and on v everywhere."""
+def test_noise_reaches_the_networks() -> None:
+    """Noise is added to theta and T inside B, and to v everywhere."""
     field, (standing, conditions) = field_of(), bodies()
     noisy = replace(conditions, pose=conditions.pose + 0.01, root=conditions.root + 0.02)
     draws = replace(DRAWS, view=torch.tensor([[0.0, 0.03, -0.04]]))
     field.sample(field.scene(standing, noisy), RAY, draws)
     for _, pose, root, view in field.radiance.asked:
         within = pose.abs().sum(1) > 0
-        same(pose[within], rows([[0.11, 0.21, 0.31]]).expand(int(within.sum()), 3))
-        same(root[within], torch.tensor(TURN).expand(int(within.sum()), 12) + 0.02)
+        expect_close(pose[within], rows([[0.11, 0.21, 0.31]]).expand(int(within.sum()), 3))
+        expect_close(root[within], torch.tensor(TURN).expand(int(within.sum()), 12) + 0.02)
         assert within.any() and not root[~within].any()
-        same(view, rows([[1.0, 0.03, -0.04]]).expand_as(view))
-    same(field.residual.asked[-1][1], rows([[0.11, 0.21, 0.31]] * 3))
+        expect_close(view, rows([[1.0, 0.03, -0.04]]).expand_as(view))
+    expect_close(field.residual.asked[-1][1], rows([[0.11, 0.21, 0.31]] * 3))
 
 
-def test_f_sees_no_root_where_it_is_no_condition() -> None:
+def test_f_has_no_root_input_without_the_root_condition() -> None:
     field = field_of(root_condition=False)
     sampled(field)
     assert field.radiance.asked[-1][2].shape == (8, 0)
 
 
-def test_the_static_form_sees_the_place_alone() -> None:
-    """F sees three coordinates inside and outside B, neither pose nor root; DH is evaluated inside B only."""
+def test_the_static_form_has_only_the_position_as_input() -> None:
+    """F gets three coordinates inside and outside B, and neither pose nor root. DH is evaluated only inside B."""
     field = field_of(static=True)
     sampled(field)
     point, pose, root, view = field.radiance.asked[-1]
-    same(point, outside(3))
+    expect_close(point, outside(3))
     assert pose.shape == root.shape == (8, 0)
-    same(view, rows([[1.0, 0, 0]] * 8))
+    expect_close(view, rows([[1.0, 0, 0]] * 8))
     point, pose = field.residual.asked[-1]
-    same(point, outside(3)[3:6])
+    expect_close(point, outside(3)[3:6])
     assert pose.shape == (3, 0)
 
 
 @pytest.mark.parametrize("static", [False, True])
-def test_density_counts_per_scene_unit(static: bool) -> None:
+def test_density_is_per_scene_unit(static: bool) -> None:
     """A metre halves the light; nothing is visible behind the last sample."""
     samples, _ = sampled(field_of(static))
     ways_m = [0.2, 0.3, 0.7, 0.1, 0.9, 0.7, 0.3]
-    same(samples.alpha, rows([[1 - 0.5**way for way in ways_m] + [1.0]]))
-    same(samples.density, torch.full((1, 8), 2 * math.log(2)))
+    expect_close(samples.alpha, rows([[1 - 0.5**way for way in ways_m] + [1.0]]))
+    expect_close(samples.density, torch.full((1, 8), 2 * math.log(2)))
     assert not samples.background.any()
 
 
@@ -212,23 +213,23 @@ def test_density_counts_per_scene_unit(static: bool) -> None:
     ("static", "residual", "norms"),
     [(False, [0.02, 0.02, 0.02], [1.01**0.5] * 3), (True, [-0.025, -0.02, 0.025], [0.9, 0.9, 1.1])],
 )
-def test_distances_are_in_scene_units_and_their_gradient_in_metres(
+def test_distances_are_in_scene_units_and_their_gradients_per_metre(
     static: bool, residual: list[float], norms: list[float]
 ) -> None:
-    """Outside B the body is 1 away and has no residual. From the faces d rises by 1 per metre, along or against x, and
-    the residual by a tenth: along the face, because s moves with the point, or in the static form along x."""
+    """Outside B the body has a distance of 1 and no residual. From the faces, d rises by 1 per metre, along or against
+    x. The residual rises by a tenth: along the face, because s moves with the point, or along x in the static form."""
     samples, _ = sampled(field_of(static))
-    same(samples.in_box, INSIDE[None])
+    expect_close(samples.in_box, INSIDE[None])
     d, dd = torch.ones(8), torch.zeros(8)
     d[3:6], dd[3:6] = torch.tensor([0.025, -0.025, -0.025]), torch.tensor(residual)
-    same(samples.d, d[None])
-    same(samples.residual, dd[None])
-    same(samples.alpha_dot, 1 / (1 + torch.exp(200 * (d + dd)))[None], atol=2e-3)
-    same(samples.gradient_norm, torch.tensor(norms))
-    assert sampled(field_of(static), replace(DRAWS, probe=None))[0].gradient_norm.shape == (0,)  # a rendering
+    expect_close(samples.d, d[None])
+    expect_close(samples.residual, dd[None])
+    expect_close(samples.alpha_dot, 1 / (1 + torch.exp(200 * (d + dd)))[None], atol=2e-3)
+    expect_close(samples.gradient_norm, torch.tensor(norms))
+    assert sampled(field_of(static), replace(DRAWS, probe=None))[0].gradient_norm.shape == (0,)  # in a rendering
 
 
-def test_each_loss_of_a_ray() -> None:
+def test_each_loss_of_a_ray_by_hand() -> None:
     """The ray is on the person, who is white; F paints B white and all else black. Before B half of the light is lost
     1.2 times, in it 1.7 times: 2^-1.2 - 2^-2.9 of C, 1 - 2^-1.7 of C~ is white. d_hat is .045, -.005 and -.005: of C^,
     2^-1.2 comes through to alpha_dot sigmoid(-9), sigmoid(1), sigmoid(1). Weights are the
@@ -237,7 +238,7 @@ def test_each_loss_of_a_ray() -> None:
     field.radiance = Fog(lambda point: (point[:, 3:] != 1).float().expand(-1, 3))
     correction = standing.correction()
     correction.absorbed_shape.fill_(3.0)
-    correction.absorbed_move_m[1, 1] = 4.0  # of two frames
+    correction.absorbed_move_m[1, 1] = 4.0  # one of two frames
     rays = PixelRays(*vars(RAY).values(), torch.ones(1, 3), torch.tensor([True]), torch.tensor([False]), None)
     objective = Objective(field, correction, load_settings("paper").training)
     terms = objective(field.scene(standing, conditions), rays, DRAWS)
@@ -262,8 +263,8 @@ def test_each_loss_of_a_ray() -> None:
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected, rel=5e-3, abs=1e-12)
 
 
-def test_numbers_of_the_paper() -> None:
-    """The values of section 4 and of the supplement's parameters."""
+def test_the_paper_preset_has_the_papers_values() -> None:
+    """The values are from section 4 and from the parameters in the supplement."""
     training = load_settings("paper").training
     paper, losses = training.field, training.losses
     assert (paper.samples, paper.gamma, paper.learning_rate, paper.scene_m) == (256, 200, 1e-3, 2.5)
@@ -275,17 +276,17 @@ def test_numbers_of_the_paper() -> None:
     assert LossSettings().eta == losses.eta == 1
 
 
-def test_what_is_asked_of_a_point_is_what_was_asked_in_training() -> None:
+def test_point_queries_use_the_same_inputs_as_training() -> None:
     """5 cm above the first body, at (0.5, 0.2, 1) in its frame, d_hat is .05 + 2 x .1 x .25 m."""
     field, (standing, conditions) = field_of(), bodies()
     point_m, view = torch.tensor([[1.95, 0.6, 0.05]]), torch.tensor([[0.0, 0, -1]])
-    same(field.signed_distance(standing, point_m, conditions), torch.tensor([0.1]))
-    same(field.colour(standing, point_m, view, conditions), rows([[0.25, 0.1, 0.5]]))
+    expect_close(field.signed_distance(standing, point_m, conditions), torch.tensor([0.1]))
+    expect_close(field.colour(standing, point_m, view, conditions), rows([[0.25, 0.1, 0.5]]))
     point, pose, root, seen = field.radiance.asked[-1]
-    same(point, rows([[0.25, 0.1, 0.5, 0.025]]))
-    same(pose, rows([[-0.4, 0.5, 0.6]]))
-    same(root, rows([[1.0, 0, 0, -0.275, 0, 1, 0, 0.1, 0, 0, 1, -0.25]]))
-    same(seen, view)
+    expect_close(point, rows([[0.25, 0.1, 0.5, 0.025]]))
+    expect_close(pose, rows([[-0.4, 0.5, 0.6]]))
+    expect_close(root, rows([[1.0, 0, 0, -0.275, 0, 1, 0, 0.1, 0, 0, 1, -0.25]]))
+    expect_close(seen, view)
     static = field_of(static=True)
-    same(static.signed_distance(standing, point_m, conditions), torch.tensor([0.05 + 2 * 0.1 * -0.025]))
-    same(static.colour(standing, point_m, view, conditions), rows([[-0.025, 0.2, 0.275]]))
+    expect_close(static.signed_distance(standing, point_m, conditions), torch.tensor([0.05 + 2 * 0.1 * -0.025]))
+    expect_close(static.colour(standing, point_m, view, conditions), rows([[-0.025, 0.2, 0.275]]))

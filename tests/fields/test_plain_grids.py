@@ -1,4 +1,4 @@
-"""The grids that others are compared with, by hand."""
+"""The reference grids, by hand."""
 
 import pytest
 import torch
@@ -15,8 +15,8 @@ def linear_grid() -> FeatureGrids:
     return grid
 
 
-def test_interpolation_by_hand():
-    """Trilinear interpolation reproduces a linear function, and the border's value holds outside."""
+def test_interpolation_of_a_linear_grid_by_hand():
+    """Trilinear interpolation reproduces a linear function; outside, the border's value continues."""
     points = torch.tensor([[0.25, 1.5, 3.25], [1.0, 2.0, 4.0], [7.0, 2.0, 4.0]])
     assert linear_grid()(points)[:, 0].tolist() == pytest.approx([0.25 + 15 + 325, 421, 421], rel=1e-5)
 

@@ -1,4 +1,4 @@
-"""Root condition: whether the paper's colour depends on the root transform T; its density never does."""
+"""Root condition: whether the paper's colour depends on the root transform T. Its density never does."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ RIG = box_rig()
 
 
 def seen(field: PaperField, root_condition: Tensor) -> tuple[Tensor, Tensor]:
-    """Return density and colour along one ray through the box for given conditions."""
+    """Return density and colour along one ray through the box for a given root condition."""
     bodies = PosedBodies(RIG, torch.zeros(1, 2, 3), torch.eye(4)[None], RIG.vertices_m)
     moment = torch.zeros(1, dtype=torch.long)
     conditions = Conditions(Conditions.of(RIG, bodies.theta, bodies.root, moment, 2.5).pose, root_condition, moment)
@@ -27,7 +27,7 @@ def seen(field: PaperField, root_condition: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize(("root_condition", "inputs", "depends"), [(True, 256 + 12 + 3, True), (False, 256 + 3, False)])
-def test_colour_depends_on_the_root_where_it_is_a_condition(root_condition: bool, inputs: int, depends: bool) -> None:
+def test_colour_depends_on_the_root_only_if_conditioned(root_condition: bool, inputs: int, depends: bool) -> None:
     torch.manual_seed(0)
     settings = PaperFieldSettings(samples=8, root_condition=root_condition)
     field = PaperField(RIG, torch.eye(4)[None], settings, static=False)

@@ -7,13 +7,13 @@ from tests.body.boxes import box_faces, box_vertices
 
 
 def sphere(radius_m: float) -> torch.Tensor:
-    """Return dense points (1, N, 3) on a sphere about the origin."""
+    """Return densely sampled points (1, N, 3) on a sphere about the origin."""
     points = torch.randn(40000, 3, generator=torch.Generator().manual_seed(0))
     return radius_m * torch.nn.functional.normalize(points, dim=-1)[None]
 
 
-def around(surface: torch.Tensor, outer: torch.Tensor, inner: torch.Tensor, cell_m: float) -> ShellGrid:
-    """Return the shell around surfaces whose vertices are dense enough to be the only surface points."""
+def shell_around(surface: torch.Tensor, outer: torch.Tensor, inner: torch.Tensor, cell_m: float) -> ShellGrid:
+    """Return the shell around surfaces whose vertices are dense enough to serve as the only surface points."""
     corners = torch.arange(surface.shape[1])[:, None].expand(-1, 3)
     points = corners, torch.tensor([1.0, 0.0, 0.0]).expand(len(corners), -1)
     return ShellGrid.around(surface, outer, inner, points, cell_m)
@@ -22,7 +22,7 @@ def around(surface: torch.Tensor, outer: torch.Tensor, inner: torch.Tensor, cell
 def even_shell(surface: torch.Tensor, outer_m: float, inner_m: float, cell_m: float) -> ShellGrid:
     """Return a shell of the same thickness everywhere."""
     outer, inner = (torch.full(surface.shape[:2], thickness) for thickness in (outer_m, inner_m))
-    return around(surface, outer, inner, cell_m)
+    return shell_around(surface, outer, inner, cell_m)
 
 
 def along_x(grid: ShellGrid, x_m: list[float]) -> list[int]:
@@ -32,7 +32,7 @@ def along_x(grid: ShellGrid, x_m: list[float]) -> list[int]:
 
 
 def test_box_interval_by_hand():
-    """Along x into [1, 2]: from 1 to 2; a ray that misses has no length."""
+    """A ray along x is in [1, 2] from depth 1 to 2; for a ray that misses, the interval is empty."""
     origins = torch.tensor([[0.0, 0.5, 0.5], [0.0, 5.0, 0.5]])
     rays = Rays(origins, torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), torch.zeros(2).long())
     lower, upper = torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), torch.tensor([[2.0, 1.0, 1.0]]).expand(2, 3)
@@ -41,9 +41,9 @@ def test_box_interval_by_hand():
     assert near[1] == far[1]
 
 
-def test_a_ray_begins_at_its_camera():
-    """Inside [1, 2] along x: from 0 to the side half a metre ahead, or to y = 0.74, 0.24 / 0.6 away; of a box behind
-    there is nothing."""
+def test_box_interval_of_a_ray_that_starts_inside():
+    """Inside [1, 2] along x, the interval is from 0 to the side half a metre ahead, or to y = 0.74, 0.24 / 0.6 away. A
+    box behind the camera gives an empty interval."""
     origins = torch.tensor([[1.5, 0.5, 0.5], [1.5, 0.5, 0.5], [4.0, 0.5, 0.5]])
     directions = torch.tensor([[1.0, 0, 0], [0.8, 0.6, 0], [1, 0, 0]])
     lower, upper = torch.tensor([[1.0, 0.0, 0.0]]).expand(3, 3), torch.tensor([[2.0, 0.74, 1.0]]).expand(3, 3)
@@ -52,21 +52,22 @@ def test_a_ray_begins_at_its_camera():
     torch.testing.assert_close(far, torch.tensor([0.5, 0.4, 0.0]))
 
 
-def test_states_around_a_sphere():
+def test_cell_states_around_a_sphere():
     grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.02)
     assert along_x(grid, [0.0, 0.27, 0.33, 0.42, 5.0]) == [SOLID, SHELL, SHELL, EMPTY, EMPTY]
 
 
-def test_the_shell_is_as_thick_as_its_surface_asks():
-    """The shell is thick for x > 0 and thin on the other side: a point 8 cm off lies in it on one side only."""
+def test_the_shell_has_the_thickness_of_each_surface_point():
+    """The shell is thick for x > 0 and thin on the other side, so a point 8 cm from the surface is in the shell on one
+    side only."""
     surface = sphere(0.3)
     outer = torch.where(surface[..., 0] > 0, 0.1, 0.02)
-    grid = around(surface, outer, torch.full_like(outer, 0.02), 0.01)
+    grid = shell_around(surface, outer, torch.full_like(outer, 0.02), 0.01)
     assert along_x(grid, [0.38, -0.38, 0.31, -0.31]) == [SHELL, EMPTY, SHELL, SHELL]
 
 
-def test_the_shell_is_all_that_any_surface_point_reaches():
-    """Every cell is tried with every one of 60 points that are not equally thick."""
+def test_shell_cells_are_those_within_reach_of_any_surface_point():
+    """Every cell is compared with each of 60 points of different thickness."""
     random = torch.Generator().manual_seed(0)
     points = (torch.rand(60, 3, generator=random) * torch.tensor([6, 7, 8]) + 4).long()
     outer, inner = 1 + torch.rand(2, 60, generator=random)
@@ -79,18 +80,19 @@ def test_the_shell_is_all_that_any_surface_point_reaches():
 
 
 def test_every_frame_has_its_own_surface_and_thickness():
-    """A sphere of 0.3 m with a shell of 2 cm, and one of 0.2 m with 8 cm, checked 5 cm outside."""
+    """A sphere of 0.3 m with a shell of 2 cm and one of 0.2 m with a shell of 8 cm are checked 5 cm outside their
+    surfaces."""
     outer = torch.tensor([0.02, 0.08])[:, None].expand(-1, 40000)
     surfaces = torch.cat([sphere(0.3), sphere(0.2)])
-    grid = around(surfaces, outer, torch.full_like(outer, 0.04), 0.01)
+    grid = shell_around(surfaces, outer, torch.full_like(outer, 0.04), 0.01)
     rays = Rays(torch.zeros(4, 3), torch.eye(3)[[0, 0, 0, 0]], torch.tensor([0, 1, 1, 0]))
     found = grid.cell_states(rays, torch.tensor([[0.35], [0.25], [0.35], [0.25]]))[:, 0].tolist()
     assert found == [EMPTY, SHELL, EMPTY, SOLID]
 
 
-def test_between_vertices_a_surface_is_where_its_points_are():
-    """A unit box about the origin with a thick shell at the corners of x > 0, checked on its faces, away from
-    corners."""
+def test_the_shell_covers_faces_between_vertices():
+    """A unit box about the origin has a thick shell at the corners with x > 0. It is checked at the centres of its
+    faces."""
     corners_m = box_vertices() - 0.5
     outer = torch.where(corners_m[None, :, 0] > 0, 0.2, 0.02)
     points = surface_points(corners_m, box_faces(), 0.01)
@@ -98,8 +100,9 @@ def test_between_vertices_a_surface_is_where_its_points_are():
     assert along_x(grid, [0.5, 0.65, -0.5, -0.65]) == [SHELL, SHELL, SHELL, EMPTY]
 
 
-def test_a_lattice_divides_long_edges():
-    """A right triangle with legs of 3: spacing 1.5 cuts its longest edge (4.24) in three, so 10 points in all."""
+def test_surface_points_subdivide_long_edges():
+    """For a right triangle with legs of 3, a spacing of 1.5 divides the longest edge (4.24) into three, which gives 10
+    points in all."""
     vertices = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
     corners, weights = surface_points(vertices, torch.tensor([[0, 1, 2]]), 1.5)
     points = (vertices[corners] * weights[..., None]).sum(1)
@@ -108,9 +111,9 @@ def test_a_lattice_divides_long_edges():
     torch.testing.assert_close(points, points.round())
 
 
-def test_samples_lie_in_the_shell_before_the_solid():
-    """Through the middle of a sphere of 0.3 m from 1 m away: entered 5 cm before the surface, left at the solid
-    core."""
+def test_samples_lie_in_the_shell_in_front_of_the_solid_core():
+    """A ray through the centre of a sphere of 0.3 m, from 1 m away, enters the shell 5 cm before the surface and ends
+    at the solid core."""
     grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
     origins_m, directions = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]), torch.eye(3)[[0, 0]]
     rays = Rays(origins_m, directions, torch.zeros(2, dtype=torch.long))
@@ -121,7 +124,7 @@ def test_samples_lie_in_the_shell_before_the_solid():
     assert (depths[0].diff() > 0).all()
     assert depths[0, 0].item() == pytest.approx(0.65, abs=0.03)
     assert depths[0, -1].item() == pytest.approx(0.74, abs=0.03)
-    jitter = torch.full((2, 20), 1 - 2**-24)  # the largest below 1: 19 and it are 20 in single precision
+    jitter = torch.full((2, 20), 1 - 2**-24)  # the largest below 1; 19 plus it rounds to 20 in single precision
     assert grid.sample_rays(rays, jitter)[0][0, -1].item() == pytest.approx(0.74, abs=0.03)
 
 

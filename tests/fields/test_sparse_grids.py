@@ -1,4 +1,4 @@
-"""The kept nodes' features, interpolated and differentiated by warp as by the plain grids."""
+"""Features of the nodes that are kept: interpolation and gradients with warp match the plain grids."""
 
 import torch
 from torch import Tensor
@@ -12,12 +12,12 @@ POINTS = torch.cat([torch.rand(200, 3, generator=torch.Generator().manual_seed(1
 
 
 def low(nodes_m: Tensor, beyond_m: float) -> Tensor:
-    """Return what lies below 0.6 m, and above it by no more than `beyond_m`."""
+    """Return the nodes that lie below 0.6 m, or above it by at most `beyond_m`."""
     return nodes_m[:, 2] <= 0.6 + beyond_m
 
 
 def both(near=everywhere) -> tuple[SparseGrids, FeatureGrids]:
-    """Return the same random features as sparse and as plain grids; those that the first lacks are zero."""
+    """Return sparse and plain grids with the same random features; those that the sparse grids lack are zero."""
     torch.manual_seed(0)
     sparse = SparseGrids(LOWER_M, UPPER_M, CELLS, CHANNELS, near)
     torch.nn.init.normal_(sparse.features)
@@ -27,8 +27,8 @@ def both(near=everywhere) -> tuple[SparseGrids, FeatureGrids]:
     return sparse, plain
 
 
-def test_interpolation_and_gradients_are_those_of_plain_grids() -> None:
-    """Also at the corners of the box and beyond its faces."""
+def test_interpolation_and_gradients_match_plain_grids() -> None:
+    """This includes the corners of the box and positions beyond its faces."""
     gradient = torch.randn(len(POINTS), len(CELLS) * CHANNELS, generator=torch.Generator().manual_seed(2))
     found = []
     for grids in both():
@@ -44,8 +44,8 @@ def test_interpolation_and_gradients_are_those_of_plain_grids() -> None:
         torch.testing.assert_close(mine, plain, atol=2e-5, rtol=1e-4)
 
 
-def test_where_there_are_samples_every_node_is_kept() -> None:
-    """Samples below 0.6 m find what plain grids hold; above it and beyond a cell, features are zero."""
+def test_all_nodes_near_samples_are_kept() -> None:
+    """Below 0.6 m, samples get the features of the plain grids. More than a cell above it, features are zero."""
     sparse, plain = both(low)
     assert len(sparse.features) < len(sparse.rows)
     below = POINTS[POINTS[:, 2] < 0.6]
@@ -54,10 +54,10 @@ def test_where_there_are_samples_every_node_is_kept() -> None:
 
 
 def test_a_flat_box_is_one_cell_thick() -> None:
-    """Of 8 cells along 2 m, 4 lie along 1 m, and less than a half along 0.1 m; a cell has two nodes."""
+    """Of 8 cells along 2 m, 4 fit along 1 m, and less than half a cell along 0.1 m. A single cell has two nodes."""
     grids = SparseGrids(LOWER_M, torch.tensor([1.0, 2.0, 0.1]), (8,), CHANNELS, everywhere)
     assert grids.sizes.tolist() == [[5, 9, 2]]
 
 
-def test_no_points_have_no_features() -> None:
+def test_an_empty_batch_of_points_gives_empty_features() -> None:
     assert both()[0](POINTS[:0]).shape == (0, len(CELLS) * CHANNELS)
