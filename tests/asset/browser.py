@@ -101,7 +101,7 @@ class Page:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def complaints(self) -> list[dict[str, Any]]:
-        """Return the warnings and errors that the console shows."""
+        """Return the warnings, errors and exceptions that the page logged."""
         console = [e["params"] for e in self.events if e["method"] == "Runtime.consoleAPICalled"]
         return [
             *(call for call in console if call["type"] in ("warning", "error", "assert")),

@@ -58,7 +58,7 @@ class Pictured(Capture):
         return self.pictures[frame]
 
 
-def test_the_albedo_of_a_grey_column_is_one_grey(pictures: dict[int, np.ndarray]) -> None:
+def test_the_albedo_of_a_uniform_column_is_uniform(pictures: dict[int, np.ndarray]) -> None:
     """The light is scaled so that E is 1 at the brightest point."""
     body = figure.bending_body()
     still_m = np.zeros((len(body.frames), *body.rig.vertices_m.shape), np.float32)

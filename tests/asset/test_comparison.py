@@ -95,7 +95,7 @@ def test_the_albedo_is_rendered_in_its_light_with_the_cameras_exposure(recorded:
     shown = found.renders["albedo"]
     row, column = np.argwhere(shown[..., 3] == 255).mean(0).astype(int)
     surface = Surface(trimesh.Trimesh(points_m, staged.faces, process=False))
-    hits = surface.cast(*side_camera().rays(np.array([[column + 230.0, row + 100]])))  # where the box begins
+    hits = surface.cast(*side_camera().rays(np.array([[column + 230.0, row + 100]])))  # from the box's corner
     normal = hits.barycentric[0] @ normals_of(points_m, staged.faces)[staged.faces[hits.face[0]]]
     linear = 0.5 * (0.5 + 2 / 3 * -0.3 * 3**0.5 * (staged.stage_from_world @ normal)[2] / np.linalg.norm(normal))
     expected = 255 * (1.055 * linear ** (1 / 2.4) - 0.055) * np.array([0.5, 1.0, 1.2])
@@ -125,7 +125,7 @@ def test_large_boxes_are_scaled_down(recorded: Capture, staged: StagedAvatar, mo
     (found,) = compare_with_field(recorded, masks_of((4,)), GreyField(bending_body()), grey(staged, 100))
     assert found.photograph.shape == (95, 95, 3) and {r.shape for r in found.renders.values()} == {(95, 95, 4)}
     assert found.scores["field"]["mask_iou"] == pytest.approx(75**2 / 95**2)
-    # The column, 36 cm by 1.7 m and 5 m away, covers 36 px by 136 px of the photograph.
+    # The column, 36 cm by 1.7 m at 5 m, covers 36 px by 136 px of the photograph.
     assert (found.renders["asset"][..., 3] > 127).sum() == pytest.approx(18 * 68, rel=0.1)
 
 

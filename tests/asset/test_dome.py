@@ -31,7 +31,7 @@ def test_a_dome_has_the_irradiance_of_its_light() -> None:
         np.testing.assert_allclose(lit, light.irradiance(normals), atol=0.02)
 
 
-def test_a_constant_light_is_one_grey() -> None:
+def test_the_dome_of_a_uniform_light_is_a_single_grey() -> None:
     picture, intensity = dome(Light(0.5 * np.eye(9)[0], 0.0))
     assert picture.shape == (HEIGHT_PX, 2 * HEIGHT_PX, 3)
     assert picture.min() >= 250 and abs(intensity - 0.5) < 0.01

@@ -108,7 +108,7 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
     assert [report["levels"][lod]["triangles"] for lod in ("lod0", "lod1")] == [report["mesh"]["faces"], 500]
-    assert report["light"] is None  # without photographs
+    assert report["light"] is None  # no light without photographs
     assert (report["frames"], report["joints"], report["cameras"]) == (4, 3, 1)
     assert report["rigs"]["game"]["influences"] == 2 and report["rigs"]["game"]["moved_max_mm"] < 0.01
     assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}
@@ -122,7 +122,7 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
 
 
 @pytest.mark.usefixtures("small_report")
-def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path) -> None:
+def test_usd_has_both_meshes_with_topology_both(tmp_path: Path) -> None:
     for topology, splats in (("registered", 0), ("both", 300)):
         (tmp_path / topology).mkdir()
         settings = overridden(SMALL, [f"topology={topology}", f"splats={splats}"])
@@ -149,7 +149,7 @@ def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path) -> None:
         assert triangles == [faces, one["mesh"]["faces"]], name
 
 
-def test_a_motion_that_lacks_a_joint_is_refused_before_anything_is_made(
+def test_a_motion_that_lacks_a_joint_is_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hnerf.asset.export._rest_meshes", lambda *_: pytest.fail("a surface was extracted"))

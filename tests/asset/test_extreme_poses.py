@@ -31,7 +31,7 @@ def joints_m(rig: Rig, theta: torch.Tensor | None) -> dict[str, np.ndarray]:
 
 def test_joint_turns_are_about_stage_axes_and_mirrored_to_the_other_side() -> None:
     arms = dataclasses.replace(column_rig(), joint_names=("upper.R", "upper.L"))
-    theta = turned(arms, {"upper.L": (0, 0, 90)})  # about the axis to the front, which is -Y of the body
+    theta = turned(arms, {"upper.L": (0, 0, 90)})  # about the stage's front axis, which is -Y of the body
     assert theta is not None
     torch.testing.assert_close(theta, torch.tensor([[0, math.pi / 2, 0], [0, -math.pi / 2, 0]]))
     assert turned(arms, {"lower.L": (0, 0, 90)}) is None

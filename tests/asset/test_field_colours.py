@@ -22,7 +22,7 @@ def test_colours_are_read_on_the_fields_own_surface() -> None:
             return super().colour(points_m, directions, theta, root)
 
     body = bending_body()
-    clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far inside
+    clothes = upright_column(0.175, 0.2, 1.4)  # its sides are 1.5 cm outside the field's surface, its caps far inside
     layout = unwrap(clothes.vertices, clothes.faces, 64)
     posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
     field_colours(Recording(body), posed, rasterise(layout, 64), no_cavities(posed))

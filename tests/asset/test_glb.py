@@ -189,7 +189,7 @@ def test_correctives_are_morph_targets_with_one_weight_per_frame(glb: Path, stag
     weights = accessor(document, document.animations[0].samplers[-1].output).reshape(len(FRAMES), -1)
     expected = staged.rigs["full"].motions["captured"].shape_weights
     np.testing.assert_allclose(weights[:, :-2], expected)
-    assert (weights[:, -2:] == 0).all()  # of the expression and the physique
+    assert (weights[:, -2:] == 0).all()  # the motion does not use the expression and the physique
 
 
 def test_expressions_and_physiques_are_morph_targets_after_the_correctives(glb: Path, staged: StagedAvatar) -> None:
@@ -214,7 +214,7 @@ def test_expressions_and_physiques_are_morph_targets_after_the_correctives(glb: 
     np.testing.assert_allclose((item.min, item.max), ([0, 0, -0.02], [0.01, 0.03, 0]), atol=1e-7)
 
 
-def test_the_khronos_validator_finds_nothing(glb: Path) -> None:
+def test_the_khronos_validator_finds_no_issues(glb: Path) -> None:
     """Needs `npm install gltf-validator` in a parent folder or in one that NODE_PATH names."""
     node = shutil.which("node")
     if not node or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode:

@@ -84,7 +84,7 @@ def test_turning_about_one_axis_reveals_no_light_along_it() -> None:
 
 
 def test_a_rotated_light_has_the_same_irradiance_at_rotated_normals() -> None:
-    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # x to y
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # takes x to y
     light = Light(COEFFICIENTS, 3.0)
     normals = directions(20)
     turned = light.turned(quarter)

@@ -71,7 +71,7 @@ def test_the_first_joint_combines_world_rotation_with_its_own() -> None:
     body = bending_body()
     theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None].clone()
     theta[0, 0, 2] = np.pi / 2
-    root[0, :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z, z to -y
+    root[0, :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # takes y to z and z to -y
     found = motion_of(BodyFit(body.rig, (3,), theta, root), 10.0, np.zeros((1, 0)), np.eye(3)).turns[0, 0]
     left, front = (Y_UP_FROM_Z_UP @ axis for axis in ([1.0, 0, 0], [0, -1.0, 0]))
     np.testing.assert_allclose([found @ left, found @ front], [[0, 0, 1], [1, 0, 0]], atol=1e-6)

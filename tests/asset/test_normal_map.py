@@ -48,10 +48,10 @@ def map_of(
     ("normal", "uvs", "colour"),
     [
         ((0.6, 0, 0.8), CORNERS, (204, 128, 230)),  # (1 + 0.6) / 2, (1 + 0) / 2, (1 + 0.8) / 2 of 255
-        ((0, 0.6, 0.8), CORNERS, (128, 204, 230)),  # v runs up
-        ((0.6, 0, 0.8), CORNERS * (-1, 1) + (1, 0), (51, 128, 230)),  # mirrored: u falls along x
+        ((0, 0.6, 0.8), CORNERS, (128, 204, 230)),  # v points up
+        ((0.6, 0, 0.8), CORNERS * (-1, 1) + (1, 0), (51, 128, 230)),  # mirrored: u decreases along x
         ((0, 0.6, 0.8), CORNERS * (-1, 1) + (1, 0), (128, 204, 230)),  # and v rises along y
-        ((0.6, 0, 0.8), CORNERS[:, ::-1] * (1, -1) + (0, 1), (128, 51, 230)),  # turned: v falls along x
+        ((0.6, 0, 0.8), CORNERS[:, ::-1] * (1, -1) + (0, 1), (128, 51, 230)),  # rotated: v decreases along x
     ],
 )
 def test_normal_map_of_a_tilted_plane(
@@ -65,7 +65,7 @@ def test_normal_map_of_a_tilted_plane(
 @pytest.mark.parametrize(
     ("normal", "height_m", "hidden"),
     [
-        ((1.0, 0, 0), 0, False),  # at right angles to the mesh
+        ((1.0, 0, 0), 0, False),  # perpendicular to the mesh
         ((0.6, 0, 0.8), 0.02, False),  # a step of 20 (2 - 2 x 20 / 30) = 13.3 mm leaves 20 - 0.8 x 13.3 = 9.3 mm
         ((0.6, 0, 0.8), 0, True),
     ],

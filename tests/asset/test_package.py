@@ -98,7 +98,7 @@ def test_each_topology_selects_full_detail_and_the_motion_of_the_file(name: str,
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
-def test_either_topology_is_skinned_in_all_its_variants(
+def test_both_topologies_are_skinned_in_all_variants(
     name: str, both: Path, staged: StagedAvatar, captured: StagedAvatar
 ) -> None:
     stage = Usd.Stage.Open(str(both / name))
@@ -330,7 +330,7 @@ def pixels(path: Sdf.AssetPath) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
-def test_the_albedo_look_has_the_light_that_was_taken_out(name: str, package: Path, staged: StagedAvatar) -> None:
+def test_the_albedo_look_comes_with_the_light_that_was_removed(name: str, package: Path, staged: StagedAvatar) -> None:
     stage = Usd.Stage.Open(str(package / name))
     look = stage.GetDefaultPrim().GetVariantSet("look")
     assert (look.GetVariantNames(), look.GetVariantSelection()) == (["albedo", "captured"], "captured")

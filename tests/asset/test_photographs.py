@@ -111,7 +111,7 @@ def test_a_square_behind_the_camera_is_not_seen() -> None:
 def test_a_slanted_surface_does_not_occlude_itself() -> None:
     """The surface is seen at 60 degrees from 2 m away. A texel that is half a pixel, 1 cm, off its pixel's ray is up to
     1.7 cm farther away than the point that the ray hits, which is less than 1 cm / cos 60."""
-    share = np.linspace(0.38, 0.5, 50)  # of corner 0, at x from 0.1 m to 0
+    share = np.linspace(0.38, 0.5, 50)  # weight of corner 0, for x from 0.1 m to 0
     texels = texels_at([0] * 50, [[s, 0.5, 0.5 - s] for s in share.tolist()])
     index, cosine, _, _ = visible_texels(camera("side", np.pi / 3), SeenSurface.of(square(0.4, 0.0), FACES), texels)
     assert index.tolist() == list(range(50))

@@ -74,6 +74,6 @@ def test_the_two_sides_of_a_narrow_gap_move_together() -> None:
     plate = Plate.of(boxes.vertices, boxes.faces)
     first = boxes.vertices[:, 0] < 0.0101
     wanted = np.where(first, 0.01, 0.0)[:, None]
-    moved = plate.solver(np.ones(len(wanted)), 0.1)(wanted)  # each box is stiff
+    moved = plate.solver(np.ones(len(wanted)), 0.1)(wanted)  # so each box is stiff
     assert moved[first].mean() - moved[~first].mean() < 0.004  # without coupling it would be 0.01
     assert moved.mean() == pytest.approx(0.005, rel=0.01)

@@ -15,7 +15,7 @@ def test_triangle_pairs_become_quads_that_start_on_the_diagonal() -> None:
 @pytest.mark.parametrize(
     "faces",
     [SQUARES[:3], SQUARES[[0, 2, 1, 3]], np.array([[0, 1, 2], [2, 0, 3]])],
-    ids=["odd", "not in turn", "turned over"],
+    ids=["odd number", "halves not consecutive", "reversed winding"],
 )
 def test_triangles_that_form_no_quads_stay_triangles(faces: np.ndarray) -> None:
     np.testing.assert_array_equal(polygon_corners(faces), np.arange(faces.size).reshape(-1, 3))

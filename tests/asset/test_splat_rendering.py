@@ -6,7 +6,7 @@ from hnerf.asset.splat_rendering import covariances, projected, render_splats
 from hnerf.geometry.camera import Camera
 
 STRAIGHT = np.array([[1.0, 0, 0, 0]])  # no rotation
-QUARTER = np.array([[0.5**0.5, 0, 0, 0.5**0.5]])  # by 90 degrees about z: x to y
+QUARTER = np.array([[0.5**0.5, 0, 0, 0.5**0.5]])  # rotates by 90 degrees about z: x to y
 RED, GREEN = [1.0, 0, 0], [0, 1.0, 0]
 
 

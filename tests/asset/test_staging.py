@@ -109,7 +109,7 @@ def test_expressions_and_physiques_are_rotated_to_stage_axes(staged: StagedAvata
     np.testing.assert_allclose(staged.physiques_m["stout"], stout_m, atol=1e-6)
     moved_m = staged.expressions_m["frown"]
     top = moved_points(moved_m)
-    np.testing.assert_array_equal(top, np.flatnonzero(staged.rest_points_m[:, 1] > 1.65))  # 5 cm were below the ground
+    np.testing.assert_array_equal(top, np.flatnonzero(staged.rest_points_m[:, 1] > 1.65))  # the column was 5 cm lower
     np.testing.assert_allclose(moved_m[top], np.tile([0.01, 0.03, -0.02], (len(top), 1)), atol=1e-7)
     assert moved_points(np.full((4, 3), 1e-6)).tolist() == [0]
 

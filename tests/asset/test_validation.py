@@ -154,7 +154,7 @@ def test_an_eye_joint_off_the_centre_of_its_eyeball_is_reported(stage: Usd.Stage
         assert ("does not turn about" in "; ".join(data_defects(stage))) is wrong
 
 
-def test_an_albedo_needs_its_light(stage: Usd.Stage) -> None:
+def test_an_albedo_without_its_light_is_reported(stage: Usd.Stage) -> None:
     stage.SetEditTarget(stage.GetSessionLayer())
     stage.GetDefaultPrim().GetVariantSet("look").SetVariantSelection("albedo")
     assert data_defects(stage) == []
@@ -162,7 +162,7 @@ def test_an_albedo_needs_its_light(stage: Usd.Stage) -> None:
     assert data_defects(stage) == ["/Avatar: the albedo has no light with a picture"]
 
 
-def test_a_game_rig_has_few_influences(stage: Usd.Stage) -> None:
+def test_a_game_rig_with_more_than_4_influences_is_reported(stage: Usd.Stage) -> None:
     stage.SetEditTarget(stage.GetSessionLayer())
     stage.GetDefaultPrim().GetVariantSet("rig").SetVariantSelection("game")
     assert data_defects(stage) == []
@@ -215,7 +215,7 @@ def test_other_shapes_are_checked_in_the_motion_that_the_file_selects() -> None:
     ]  # fmt: skip
 
 
-def test_what_we_write_passes_every_validator(package: Path) -> None:
+def test_written_packages_pass_every_validator(package: Path) -> None:
     for name in ("avatar.usdz", "avatar.usda", "avatar_24.usda"):
         report = validate_package(package / name)
         assert (report["variants"], report["warnings"]) == (20, [])
@@ -249,7 +249,7 @@ def test_a_defect_is_reported_with_its_variant(package: Path, tmp_path: Path) ->
         validate_package(tmp_path / "copy/avatar.usda")
 
 
-def test_an_error_of_usd_itself_raises(package: Path, tmp_path: Path) -> None:
+def test_errors_of_usds_own_validators_are_raised(package: Path, tmp_path: Path) -> None:
     """The layer is exported without its texture next to it."""
     whole = Usd.Stage.Open(str(package / "avatar.usdz"))
     whole.GetRootLayer().Export(str(tmp_path / "loose.usdc"))

@@ -91,7 +91,7 @@ def test_cameras_and_photographs_are_in_the_avatars_world(photographed: Capture,
 
 
 @NEEDS_THREE
-def test_every_import_is_in_the_page(viewer: Path) -> None:
+def test_the_page_contains_every_imported_module(viewer: Path) -> None:
     modules = _modules()
     for name, source in modules.items():
         code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
@@ -166,7 +166,7 @@ def test_a_slider_turns_its_joint_on_top_of_the_motion(page: Page) -> None:
     page.evaluate(move("#turns input", 90, "input"))
     about_x = Rotation.from_euler("x", 90, degrees=True)
     expected = (Rotation.from_quat(before) * about_x).as_matrix()
-    for _ in range(2):  # the second time it must not be added again
+    for _ in range(2):  # the second time, the turn must not be added again
         page.evaluate("viewer.setTime(0.2)")
         turned = Rotation.from_quat(page.evaluate(quaternion)).as_matrix()
         np.testing.assert_allclose(turned, expected, atol=1e-6)

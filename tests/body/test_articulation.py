@@ -112,7 +112,7 @@ def test_an_offset_turns_with_its_bone() -> None:
     points = with_offsets(articulation.keypoints(), offsets)
     where = articulation.jacobian(points, articulation.pose(pose))[0][0]
     torch.testing.assert_close(where[2], torch.tensor([0.75, 0, 1.0], dtype=torch.float64))
-    torch.testing.assert_close(where[7], torch.tensor([0.5, 0, 1.0], dtype=torch.float64))  # the same vertex, no offset
+    torch.testing.assert_close(where[7], torch.tensor([0.5, 0, 1.0], dtype=torch.float64))  # same vertex, no offset
 
 
 def test_root_rotation_keeps_the_root_joint_in_place() -> None:

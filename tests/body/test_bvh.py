@@ -45,7 +45,7 @@ def test_a_bvh_pose_by_hand(tmp_path: Path) -> None:
     turns, at = file.world()
     np.testing.assert_allclose(at[0], [[0, 0, 0], [10, 0, 0]])  # the root's position channels replace its offset
     np.testing.assert_allclose(at[1], [[4, 5, 6], [4, 5, -4]], atol=1e-9)
-    # Rz(90) Ry(90): x to -z, y to -x, z to y. After the elbow's Rz(90), its x is that y.
+    # Rz(90) Ry(90) takes x to -z, y to -x and z to y. The elbow's own Rz(90) first takes its x to y.
     np.testing.assert_allclose(turns[1, 1] @ [1, 0, 0], [-1, 0, 0], atol=1e-9)
 
 

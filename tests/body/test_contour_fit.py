@@ -102,7 +102,7 @@ def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() ->
         assert ((rows.gradient * outwards).sum(1) > 0.9).all()  # moving outwards raises the residual 1:1
 
 
-def test_a_body_that_fills_its_mask_is_left_alone() -> None:
+def test_a_body_that_fills_its_mask_is_not_moved() -> None:
     assert np.abs(matched(disc(SEEN_PX))[0].residual_m).max() < SCALE_M
 
 
@@ -188,7 +188,7 @@ def test_residuals_add_gradient_and_curvature_to_the_normal_equations() -> None:
     assert not equations.frame_gradient[0].any() and not equations.border[0].any()
 
 
-def test_a_sole_is_as_thick_as_the_mask_reaches_below_the_foot() -> None:
+def test_sole_thickness_is_how_far_the_mask_reaches_below_the_foot() -> None:
     """A camera at a height of 1 m looks horizontally at the axis, 3 m away. A foot 0.3 m lower is 28.16 px below the
     image's middle, at row 156.16. A mask that ends at row 159.5 reaches 3.34 px farther down, of 3 / 281.6 m each. A
     toe more than 15 mm above the ground is ignored. A mask that ends above the foot gives a sole of 0; a sole is at

@@ -218,7 +218,7 @@ def test_gradient_by_the_shape_by_hand():
         ([1.1, -0.2, 1.2], [0.0, 0.0, 0.0]),  # off its corner
     ],
 )
-def test_the_closest_point_follows_along_face_and_edge(point: list[float], follows: list[float]):
+def test_the_closest_point_slides_along_faces_and_edges(point: list[float], follows: list[float]):
     """ds_k / dx_k of a unit box has the values worked out by hand, and agrees with finite differences."""
     rig = box_rig()
     bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
@@ -257,12 +257,12 @@ def test_absorbing_a_correction_keeps_its_total():
     torch.testing.assert_close(bodies.vertices_m[0], rig.vertices_m + torch.tensor([0.25, 0.0, 0.0]))
 
 
-def test_logarithm_inverts_the_exponential():
+def test_axis_angle_from_rotation_inverts_the_exponential():
     angles = torch.tensor([[0.0, 0.0, 0.0], [1e-5, 0.0, 0.0], [0.5, -1.0, 0.3], [0.0, 3.0, 0.0]]).double()
     torch.testing.assert_close(axis_angle_from_rotation(rotation_from_axis_angle(angles)), angles)
 
 
-def test_logarithm_of_a_half_turn():
+def test_axis_angle_of_a_half_turn():
     """A half turn about z may have either sign."""
     found = axis_angle_from_rotation(torch.diag(torch.tensor([-1.0, -1.0, 1.0])))
     torch.testing.assert_close(found.abs(), torch.tensor([0.0, 0.0, torch.pi]))

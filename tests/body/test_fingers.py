@@ -64,7 +64,7 @@ def test_finger_angles_are_relative_to_straight_fingers() -> None:
     joints_m[second] = joints_m[first] + 0.04 * ahead
     joints_m[third] = joints_m[second] + 0.03 * (math.sqrt(0.75) * ahead + 0.5 * palm)
     prior = FingerPrior.of(replace(RIG, joints_m=joints_m))
-    index = slice(3, 6)  # after the thumb
+    index = slice(3, 6)  # the index finger comes after the thumb
     found_deg = torch.stack([prior.mean[index], prior.low[index, 0], prior.high[index, 0]]).rad2deg()
     expected_deg = torch.tensor([[20.0, -5, 15], [-10, -40, -10], [100, 70, 100]], dtype=torch.float64)
     torch.testing.assert_close(found_deg, expected_deg)

@@ -169,7 +169,7 @@ def test_an_arm_mirrored_in_depth_is_corrected_from_neighbouring_frames(tmp_path
         where = [joint_transforms(p.rig, p.theta, p.root)[1, wrist, :3, 3] for p in (found, pose)]
         return float((where[0] - where[1]).norm())
 
-    assert off_m(mirrored) > 0.5  # descent alone stays there
+    assert off_m(mirrored) > 0.5  # descent alone does not leave this minimum
     mended = resolve_depth_flips(problem, mirrored, runs(capture))
     assert off_m(mended) < 0.02
     assert resolve_depth_flips(problem, mended, runs(capture)).theta.sub(mended.theta).abs().max() < 0.02

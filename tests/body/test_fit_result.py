@@ -27,7 +27,7 @@ def test_a_saved_fit_is_loaded_and_its_file_has_the_documented_arrays(tmp_path: 
         np.testing.assert_allclose(stored["beta"], [0.3])
 
 
-def test_a_fit_moves_to_a_device_whole() -> None:
+def test_all_tensors_of_a_fit_move_to_a_device() -> None:
     fit = BodyFit(two_bone_rig(), (3,), torch.zeros(1, 3, 3), torch.eye(4)[None]).to("meta")
     assert fit.frames == (3,)
     assert {tensor.device.type for tensor in (fit.theta, fit.root, fit.rig.vertices_m, fit.rig.faces)} == {"meta"}

@@ -33,11 +33,11 @@ def test_kabsch_never_mirrors() -> None:
 def test_shoulders_and_hips_determine_the_root_in_space() -> None:
     rest, root = rest_keypoints(), turned(2.0, 1.3)
     points = rest @ root[:3, :3].T + root[:3, 3]
-    points[4] = np.nan  # a wrist does not matter
+    points[4] = np.nan  # the wrist is not needed
     found = root_from_space(rest, points)
     assert found is not None
     np.testing.assert_allclose(found, root, atol=1e-9)
-    points[9] = np.nan  # nor a hip, as long as the rest of head and trunk is known
+    points[9] = np.nan  # nor is a hip, as long as the rest of head and trunk is known
     found = root_from_space(rest, points)
     assert found is not None
     np.testing.assert_allclose(found, root, atol=1e-9)

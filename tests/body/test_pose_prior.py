@@ -133,14 +133,14 @@ def test_smoothness_of_uneven_frames_uses_their_instants() -> None:
     x[:, :, 0] = x[:, :, 0] ** 2 / 2
     assert math.isclose(smoothness.add(equations, x, jacobian), 2 * 25 * 0.5 * 0.9, rel_tol=1e-6)
     equations = NormalEquations(4, 75, 0)
-    far = Smoothness([frames], 10.0, np.full(25, 1e9))  # quadratic
+    far = Smoothness([frames], 10.0, np.full(25, 1e9))  # far from the outlier scale, so quadratic
     cost = far.add(equations, x, jacobian)
     assert math.isclose((equations.frame_gradient * x.flatten(1).numpy()).sum(), 2 * cost, rel_tol=1e-9)
     own = np.einsum("nuu->nu", equations.frame[0])[:, 0] * 1e18 / 1e4  # (2/3, -1, 1/3), (1/3, -1, 2/3) per step^2
     np.testing.assert_allclose(own, [4 / 9, 1 + 1 / 9, 1 / 9 + 1, 4 / 9])
 
 
-def test_smoothness_does_not_reach_across_runs_of_frames() -> None:
+def test_smoothness_does_not_link_separate_runs_of_frames() -> None:
     smoothness = Smoothness([(0, 1), (5, 6)], 10.0, np.ones(25))
     x = torch.randn(4, 25, 3, dtype=torch.float64)
     assert smoothness.add(NormalEquations(4, 9, 0), x, torch.zeros(4, 25, 3, 9, dtype=torch.float64)) == 0

@@ -43,7 +43,7 @@ def test_the_elbow_bends_and_the_blended_vertex_lies_halfway() -> None:
 def test_the_root_transform_is_applied_after_the_joints() -> None:
     rig = two_bone_rig()
     root = torch.eye(4, dtype=torch.float64)
-    root[:3, :3] = rotation_from_axis_angle(torch.tensor([0, 0, HALF_PI], dtype=torch.float64))  # x to y
+    root[:3, :3] = rotation_from_axis_angle(torch.tensor([0, 0, HALF_PI], dtype=torch.float64))  # takes x to y
     root[:3, 3] = torch.tensor([10.0, 20, 30])
     tip = joint_transforms(rig, bent(), root)[2, :3, 3]
     torch.testing.assert_close(tip, torch.tensor([10.0, 21, 31], dtype=torch.float64))

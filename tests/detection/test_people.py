@@ -22,7 +22,7 @@ def standing(x: float, height_px: float = 90.0, top: float = 5.0) -> np.ndarray:
 
 
 def track(*images: np.ndarray, moves: bool = True) -> PersonTrack:
-    """Return a person seen by one camera."""
+    """Return the track of a person seen by one camera, from keypoints of each image."""
     return PersonTrack(np.stack(images)[None], 0.5, moves)
 
 

@@ -23,7 +23,7 @@ RADIUS_M = 0.1
 SIZE_PX = 64
 FRAMES = (0, 1, 2, 3)  # the last is the novel pose
 NOVEL = (3,)
-RENDERED, PHOTOGRAPHED = 102, 153  # grey levels, of 255
+RENDERED, PHOTOGRAPHED = 102, 153  # grey levels from 0 to 255
 TUNED_M = 0.02  # training raised the body of the novel frame by this: two pixels
 
 
@@ -42,7 +42,7 @@ class BallAvatar:
         return replace(self, body=body)
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
-        alpha = torch.from_numpy(seen(camera, root[:3, 3].numpy())).float()
+        alpha = torch.from_numpy(ball_mask(camera, root[:3, 3].numpy())).float()
         grey = (self.grey - self.frames_darken_by) / 255
         return Rendering(alpha[..., None].expand(-1, -1, 3) * grey, alpha, alpha)
 
@@ -61,7 +61,7 @@ def centre_m(frame: int) -> np.ndarray:
     return np.array([0.01 * frame, 0.0, 1.0])
 
 
-def seen(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
+def ball_mask(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
     """Return the mask (H, W) bool of pixels whose rays hit the ball."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1)
     origins, directions = camera.rays(pixels.astype(np.float64))
@@ -112,7 +112,7 @@ def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -
     capture = Capture(name, folder, cameras, ("a", "b"), test_cameras, FRAMES[:-1], NOVEL, 10.0, "z", sizes, sizes)
     for camera in cameras.values():
         for frame in FRAMES:
-            image = np.where(seen(camera, centre_m(frame)), PHOTOGRAPHED, 60).astype(np.uint8)
+            image = np.where(ball_mask(camera, centre_m(frame)), PHOTOGRAPHED, 60).astype(np.uint8)
             _write(folder / "images" / camera.name / f"{frame:06d}.png", image)
     (folder / "capture.toml").write_text(
         f"[cameras]\ntrain = ['a', 'b']\ntest = {list(test_cameras)}\n"
@@ -125,7 +125,7 @@ def write_ball_truth(capture: Capture, radius_m: float) -> None:
     """Write `ground_truth/` with exact masks of every view, and for frame 0 a true surface with another radius."""
     for camera in capture.cameras.values():
         for frame in FRAMES:
-            mask = seen(camera, centre_m(frame)).astype(np.uint8) * 255
+            mask = ball_mask(camera, centre_m(frame)).astype(np.uint8) * 255
             _write(capture.root / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", mask)
     ball = trimesh.creation.icosphere(5, radius_m)
     vertices = (ball.vertices + centre_m(0))[None].astype(np.float32)
@@ -136,7 +136,7 @@ def write_ball_truth(capture: Capture, radius_m: float) -> None:
 def write_ball_masks(capture: Capture, camera: str) -> None:
     """Write a camera's masks as if they came with its recording, without the left half of the ball."""
     for frame in FRAMES:
-        mask = seen(capture.cameras[camera], centre_m(frame)).astype(np.uint8) * 255
+        mask = ball_mask(capture.cameras[camera], centre_m(frame)).astype(np.uint8) * 255
         mask[:, : SIZE_PX // 2] = 0
         _write(capture.root / "masks" / camera / f"{frame:06d}.png", mask)
 
@@ -157,7 +157,7 @@ def write_settings(training: Path, kind: str = "fast", nodes: int = 8, steps: in
 
 
 def ball_inputs(capture: Capture, stages: Path) -> EvaluationInputs:
-    """Return all inputs of evaluation; `stages` has a folder for each earlier stage."""
+    """Return all inputs of evaluation; `stages` gets a folder for each earlier stage."""
     fit = ball_fit()
     folders = {f"{name}_folder": stages / name for name in ("calibration", "segmentation", "fit", "training")}
     for folder in folders.values():
@@ -166,7 +166,9 @@ def ball_inputs(capture: Capture, stages: Path) -> EvaluationInputs:
     return EvaluationInputs(
         capture_folder=capture.root,
         capture=capture,
-        masks=Masks({(n, f): encode(seen(capture.cameras[n], centre_m(f))) for n in ("a", "b") for f in FRAMES}, {}),
+        masks=Masks(
+            {(n, f): encode(ball_mask(capture.cameras[n], centre_m(f))) for n in ("a", "b") for f in FRAMES}, {}
+        ),
         fitted=fit,
         avatar=BallAvatar(fit),
         **folders,

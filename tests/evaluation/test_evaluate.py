@@ -36,8 +36,8 @@ from tests.evaluation.ball import (
     ball_camera,
     ball_fit,
     ball_inputs,
+    ball_mask,
     centre_m,
-    seen,
     tuned,
     write_ball_capture,
     write_ball_masks,
@@ -93,7 +93,7 @@ def test_image_scores_by_hand(scored: Scored) -> None:
     base, found = scored
     psnr = []
     for frame in (0, 1, 2):
-        mask = seen(TEST_CAMERA, centre_m(frame))
+        mask = ball_mask(TEST_CAMERA, centre_m(frame))
         error = mask[mask_box(mask)].mean() * ((PHOTOGRAPHED - RENDERED) / 255) ** 2
         psnr.append(-10 * np.log10(error))
     assert found["novel_view"]["psnr"] == pytest.approx(np.mean(psnr), abs=1e-4)
@@ -145,8 +145,8 @@ def test_renderings_and_meshes_have_the_documented_paths(scored: Scored) -> None
     }
     image = cv2.imread(str(out / "renders/novel_view/c/000001.png"), cv2.IMREAD_UNCHANGED)
     assert image is not None and image.shape == (64, 64, 4) and image.dtype == np.uint8
-    assert np.array_equal(image[..., 0], seen(TEST_CAMERA, centre_m(1)) * RENDERED)
-    assert np.array_equal(image[..., 3], seen(TEST_CAMERA, centre_m(1)) * 255)
+    assert np.array_equal(image[..., 0], ball_mask(TEST_CAMERA, centre_m(1)) * RENDERED)
+    assert np.array_equal(image[..., 3], ball_mask(TEST_CAMERA, centre_m(1)) * 255)
 
 
 def test_scores_agree_with_the_independent_scoring_program(scored: Scored) -> None:
@@ -166,7 +166,7 @@ def test_scores_agree_with_the_independent_scoring_program(scored: Scored) -> No
         assert ours[name] == pytest.approx(theirs[name], rel=1e-6), name
 
 
-def test_a_rendering_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+def test_a_rendering_that_cannot_be_written_raises_an_error(tmp_path: Path) -> None:
     """A folder exists at the path of a rendering."""
     view = View("novel_view", "c", 1)
     view.path(tmp_path).mkdir(parents=True)
@@ -198,8 +198,8 @@ def test_novel_poses_are_rendered_as_fitted_tuned_and_tracked(scored: Scored) ->
     """As fitted, the score is perfect, because without per-frame changes the ball has the photograph's grey and the fit
     is true. Tuned poses are two pixels too high, and tracked ones are darker as well."""
     out, found = scored[0] / "subject" / "evaluation", scored[1]
-    true = seen(TEST_CAMERA, centre_m(3))
-    lifted = seen(TEST_CAMERA, centre_m(3) + np.array([0, 0, TUNED_M]))
+    true = ball_mask(TEST_CAMERA, centre_m(3))
+    lifted = ball_mask(TEST_CAMERA, centre_m(3) + np.array([0, 0, TUNED_M]))
     for split, place, grey in (
         ("novel_pose", true, PHOTOGRAPHED),
         ("novel_pose_posed", lifted, PHOTOGRAPHED),
@@ -278,7 +278,7 @@ def test_test_cameras_without_truth_are_scored_with_the_recordings_masks(tmp_pat
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c", "d"))
     write_ball_masks(capture, "c")
     out, found = evaluated(tmp_path, ball_inputs(capture, tmp_path / "stages"))
-    whole = seen(TEST_CAMERA, centre_m(3))
+    whole = ball_mask(TEST_CAMERA, centre_m(3))
     half = whole & (np.arange(whole.shape[1]) >= whole.shape[1] // 2)
     error = (whole * RENDERED / 255 - half * PHOTOGRAPHED / 255)[mask_box(half)]
     assert found["novel_pose"]["psnr"] == pytest.approx(-10 * np.log10((error**2).mean()), abs=1e-4)
@@ -328,7 +328,7 @@ def test_pixels_of_training_cameras_are_never_scored(tmp_path: Path) -> None:
     assert "evaluation.holdout" in found["novel_pose"]["reason"]
     assert found["holdout"] is None and "evaluation.holdout=each" in found["holdout_reason"]
     rendered = sorted((out / "renders" / "novel_pose").rglob("*.png"))
-    assert [p.parent.name for p in rendered] == ["a", "b"]  # for inspection
+    assert [p.parent.name for p in rendered] == ["a", "b"]  # rendered for inspection only
     assert len(list((out / "renders" / "novel_pose_tracked").rglob("*.png"))) == 1  # only the one in the report
     assert found["novel_view"]["geometry"]["n"] == 1  # geometry needs no pixels
 

@@ -9,7 +9,7 @@ from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
 from hnerf.errors import InputError
 from hnerf.evaluation.ground_truth import GroundTruth
-from tests.evaluation.ball import PHOTOGRAPHED, centre_m, seen, write_ball_capture, write_ball_truth
+from tests.evaluation.ball import PHOTOGRAPHED, ball_mask, centre_m, write_ball_capture, write_ball_truth
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def truth(tmp_path: Path) -> GroundTruth:
 def test_without_on_black_images_the_masked_photograph_is_used(truth: GroundTruth) -> None:
     image, source = truth.on_black("c", 1)
     assert source == "image x ground-truth mask"
-    assert np.array_equal(image[..., 0], seen(truth.capture.cameras["c"], centre_m(1)) * PHOTOGRAPHED)
+    assert np.array_equal(image[..., 0], ball_mask(truth.capture.cameras["c"], centre_m(1)) * PHOTOGRAPHED)
 
 
 def test_on_black_images_take_precedence_and_are_resized_to_the_camera(truth: GroundTruth) -> None:
@@ -77,7 +77,7 @@ def test_truth_of_the_cameras_shape_or_the_recordings_size_is_accepted(truth: Gr
 def test_truth_is_synchronised_with_the_photograph(truth: GroundTruth) -> None:
     """Camera c records the instant of frame 1 in its frame 2."""
     synchronised = replace(truth, capture=truth.capture.synchronised({"c": 1.0}))
-    expected = seen(truth.capture.cameras["c"], centre_m(2))
+    expected = ball_mask(truth.capture.cameras["c"], centre_m(2))
     assert np.array_equal(synchronised.mask("c", 1), expected)
     assert np.array_equal(synchronised.on_black("c", 1)[0][..., 0], expected * PHOTOGRAPHED)
     path = truth.folder / "ground_truth" / "on_black" / "c" / "000002.jpg"
@@ -86,7 +86,7 @@ def test_truth_is_synchronised_with_the_photograph(truth: GroundTruth) -> None:
     assert synchronised.on_black("c", 1)[0].max() == 90
 
 
-def test_truth_is_undistorted_as_photographs_are(truth: GroundTruth) -> None:
+def test_truth_is_undistorted_like_photographs(truth: GroundTruth) -> None:
     """Compare with the Normaliser that ingest applies to photographs; lens distortion moves the outline."""
     camera = truth.capture.cameras["c"]
     size_px = (camera.width_px, camera.height_px)

@@ -23,8 +23,8 @@ from tests.evaluation.ball import (
     BallAvatar,
     ball_fit,
     ball_inputs,
+    ball_mask,
     centre_m,
-    seen,
     tuned,
     write_ball_capture,
     write_ball_truth,
@@ -42,7 +42,7 @@ def three_cameras(folder: Path) -> Capture:
 
 def own_mask(capture: Capture, camera: str, frame: int) -> np.ndarray:
     """Return the mask of the ball without its left half."""
-    mask = seen(capture.cameras[camera], centre_m(frame))
+    mask = ball_mask(capture.cameras[camera], centre_m(frame))
     mask[:, : mask.shape[1] // 2] = False
     return mask
 
@@ -63,7 +63,7 @@ def held_out(base: Path, capture: Capture, camera: str) -> tuple[Path, dict[str,
 def psnr_db(capture: Capture, camera: str, frame: int, grey: int) -> float:
     """Return the PSNR of a rendering that shows the whole ball in a grey level, against a photograph that shows its
     right half."""
-    mask, whole = own_mask(capture, camera, frame), seen(capture.cameras[camera], centre_m(frame))
+    mask, whole = own_mask(capture, camera, frame), ball_mask(capture.cameras[camera], centre_m(frame))
     error = (whole * grey / 255.0 - mask * PHOTOGRAPHED / 255.0)[mask_box(mask)]
     return float(-10 * np.log10((error**2).mean()))
 
@@ -79,7 +79,7 @@ def test_a_held_out_camera_is_scored_on_its_own_masked_photographs(tmp_path: Pat
     of_training_frames = [psnr_db(capture, "b", f, RENDERED - 51) for f in (0, 2)]
     assert found["novel_view"]["psnr"] == pytest.approx(np.mean(of_training_frames), abs=1e-4)
     assert found["novel_pose"]["psnr"] == pytest.approx(psnr_db(capture, "b", 3, RENDERED), abs=1e-4)
-    mask, whole = own_mask(capture, "b", 3), seen(capture.cameras["b"], centre_m(3))
+    mask, whole = own_mask(capture, "b", 3), ball_mask(capture.cameras["b"], centre_m(3))
     assert found["novel_pose"]["mask_iou"] == pytest.approx(mask.sum() / whole.sum())
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_pose", "novel_view"]
 

@@ -57,7 +57,7 @@ def test_mask_iou_uses_coverage_not_brightness() -> None:
     reference[3, 2:4] = 200
     rendered = np.dstack([reference, 255 * mask.astype(np.uint8)])
     assert score_image(rendered, reference, mask)["mask_iou"] == 1.0
-    rendered[2, 2:4, 3] = 0  # no hair
+    rendered[2, 2:4, 3] = 0  # the rendering lacks the hair
     assert score_image(rendered, reference, mask)["mask_iou"] == pytest.approx(2 / 4)
 
 

@@ -43,7 +43,7 @@ def test_alpha_from_sdf_is_independent_of_sampling():
 @pytest.mark.parametrize(
     "function", [alpha_from_sdf, lambda d, s: weights_from_alpha(alpha_from_density(d.abs() * s, s + d * 0))]
 )
-def test_gradients_in_double(function):
+def test_gradients_match_finite_differences(function):
     distance = torch.tensor([[0.021, 0.007, -0.004, -0.02]], dtype=torch.float64, requires_grad=True)
     sharpness = torch.tensor(80.0, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(function, (distance, sharpness))

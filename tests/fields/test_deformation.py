@@ -54,7 +54,7 @@ def test_node_weights_by_hand(size_m: float):
     torch.testing.assert_close(normal_displacement, share * found.normals[1, :1])
 
 
-def test_gradient_in_double():
+def test_gradients_match_finite_differences():
     found = deformation(3).double()
     described = at([4, 5, 6], [0.5, 0.25, 0.25])
     described = Descriptor(*(v.double() if v.is_floating_point() else v for v in vars(described).values()))

@@ -19,7 +19,7 @@ def test_networks_have_the_papers_sizes():
     ]
     residual = ResidualMLP(4, 57)
     assert [layer.out_features for layer in residual.trunk.layers] == [128] * 6
-    inputs = 4 * 3 + 57  # one octave
+    inputs = 4 * 3 + 57  # encoded with one octave
     assert [layer.in_features for layer in residual.trunk.layers] == [inputs, 128, 128, 128 + inputs, 128, 128]
 
 
@@ -45,7 +45,7 @@ def test_the_residual_network_starts_at_zero():
     assert ResidualMLP(4, 3)(torch.rand(5, 4), torch.rand(5, 3)).abs().max() == 0
 
 
-def test_gradients_in_double():
+def test_gradients_match_finite_differences():
     network = SkipMLP(2, 3, 4).double()
     x = torch.rand(3, 2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(network, (x,)) and torch.autograd.gradgradcheck(network, (x,))
@@ -65,7 +65,7 @@ def test_bfloat16_products_have_errors_of_at_most_a_few_percent():
     """A mantissa of eight bits has an error of 0.4 % in each of eight layers. Tensors saved for gradients are in
     bfloat16 too."""
     torch.manual_seed(0)
-    network, points, saved = SkipMLP(30, 256, 8), torch.randn(1000, 30), []  # not a multiple of 8
+    network, points, saved = SkipMLP(30, 256, 8), torch.randn(1000, 30), []  # 30 inputs: not a multiple of 8
     for layer in network.layers:
         torch.nn.init.kaiming_normal_(layer.weight)
 
@@ -110,7 +110,7 @@ def test_view_directions_are_encoded_if_octaves_are_set():
     network = RadianceMLP(4, 3, 12, view_octaves=1)
     assert network.colour[0].in_features == 256 + 12 + 9
     with torch.no_grad():
-        network.colour[0].weight[:, 268:271] = 0  # v
+        network.colour[0].weight[:, 268:271] = 0  # weights of v
     point, pose, root = torch.rand(2, 4), torch.rand(2, 3), torch.rand(2, 12)
     one, other = (network(point, pose, root, torch.full((2, 3), v))[1] for v in (1.0, -1.0))
     torch.testing.assert_close(one, other)

@@ -230,10 +230,10 @@ def test_distances_are_in_scene_units_and_their_gradients_per_metre(
 
 
 def test_each_loss_of_a_ray_by_hand() -> None:
-    """The ray is on the person, who is white; F paints B white and all else black. Before B half of the light is lost
-    1.2 times, in it 1.7 times: 2^-1.2 - 2^-2.9 of C, 1 - 2^-1.7 of C~ is white. d_hat is .045, -.005 and -.005: of C^,
-    2^-1.2 comes through to alpha_dot sigmoid(-9), sigmoid(1), sigmoid(1). Weights are the
-    paper's, and there is no fog beside the person."""
+    """The ray is on the person, who is white. F paints B white and everything else black. The fog halves the light 1.2
+    times before B and 1.7 times in it, so the white part of C is 2^-1.2 - 2^-2.9 and that of C~ is 1 - 2^-1.7. d_hat is
+    .045, -.005 and -.005. In C^, 2^-1.2 of the light reaches alpha_dot, which is sigmoid(-9), sigmoid(1), sigmoid(1).
+    Weights are the paper's. The fog loss is 0, because there is no fog beside the person."""
     field, (standing, conditions) = field_of(), bodies()
     field.radiance = Fog(lambda point: (point[:, 3:] != 1).float().expand(-1, 3))
     correction = standing.correction()

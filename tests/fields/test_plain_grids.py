@@ -21,7 +21,7 @@ def test_interpolation_of_a_linear_grid_by_hand():
     assert linear_grid()(points)[:, 0].tolist() == pytest.approx([0.25 + 15 + 325, 421, 421], rel=1e-5)
 
 
-def test_gradient_in_double():
+def test_gradients_match_finite_differences():
     grid = linear_grid().double()
     points = torch.tensor([[0.25, 1.5, 3.3], [0.6, 0.7, 1.2]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(grid, (points,))
