@@ -83,7 +83,7 @@ class Prior:
 
 
 PriorOf = Callable[[int], Prior]
-"""Makes the prior of the frame with this index in `capture.frames`: those of a long recording do not fit into memory
+"""Makes the prior of the frame of this number among `capture.frames`: those of a long recording do not fit into memory
 together."""
 
 
