@@ -46,11 +46,13 @@ def test_a_signal_during_a_weak_reference_callback_is_not_lost(
     class Referred:
         """An object that a weak reference can point to."""
 
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore SIGINT
     referred = Referred()
     reference = weakref.ref(referred, lambda _: signal.raise_signal(number))
     with pytest.raises(raised) as found, unwound_by_sigterm():
         del referred
         time.sleep(10)
+    signal.signal(signal.SIGINT, before)
     assert reference() is None and found.type is raised
 
 

@@ -13,7 +13,7 @@ from hnerf.capture.footage import Video
 from hnerf.geometry.camera import Camera
 from hnerf.render import pictures
 from hnerf.render.pictures import depth_image, depth_span_mm, normal_image, read_depth_grey, write_pictures, write_video
-from tests.evaluation.ball import RADIUS_M, RENDERED, SIZE_PX, BallAvatar, ball_camera, ball_fit, centre_m, seen
+from tests.evaluation.ball import RADIUS_M, RENDERED, SIZE_PX, BallAvatar, ball_camera, ball_fit, ball_mask, centre_m
 
 CAMERA = ball_camera("a", 0.0)  # 0.75 m from the ball, on the x axis
 
@@ -53,7 +53,7 @@ def test_normals_of_a_ball_point_away_from_its_middle() -> None:
     x, y, z = CAMERA.R @ ((point_m[0] - centre_m(0)) / RADIUS_M)
     np.testing.assert_allclose(image[28, 40], 127.5 * (np.array([x, -y, -z]) + 1), atol=2)
     assert (image[28, 40] > 127).all()
-    assert (image[~seen(CAMERA, centre_m(0))] == 0).all()
+    assert (image[~ball_mask(CAMERA, centre_m(0))] == 0).all()
 
 
 def test_a_pixel_whose_centre_misses_the_person_has_no_depth_or_normal() -> None:
@@ -78,7 +78,7 @@ def test_every_kind_of_image_and_mesh_is_written_for_every_shot(
             kind: cv2.imread(str(tmp_path / kind / f"{number:06d}.png"), cv2.IMREAD_UNCHANGED)
             for kind in ("colour", "depth", "normals", "mask")
         }
-        mask = seen(camera, centre_m(frame))
+        mask = ball_mask(camera, centre_m(frame))
         np.testing.assert_array_equal(images["colour"], np.where(mask, RENDERED, 0)[..., None].repeat(3, -1))
         np.testing.assert_array_equal(images["mask"], np.where(mask, 255, 0))
         assert images["depth"].dtype == np.uint16

@@ -26,8 +26,8 @@ from tests.evaluation.ball import (
     BallAvatar,
     ball_camera,
     ball_fit,
+    ball_mask,
     centre_m,
-    seen,
     tuned,
     write_ball_capture,
     write_ball_truth,
@@ -100,7 +100,7 @@ def found(base: Path) -> dict[str, Any]:
 
 def psnr_db(grey: float, camera: str, frame: int) -> float:
     """Return the PSNR of a ball of this grey level: only its own pixels are wrong, all by the same amount."""
-    mask = seen(ball_camera(camera, {"a": 0.0, "c": 160.0}[camera]), centre_m(frame))
+    mask = ball_mask(ball_camera(camera, {"a": 0.0, "c": 160.0}[camera]), centre_m(frame))
     return -10 * np.log10(mask[mask_box(mask)].mean() * ((PHOTOGRAPHED - round(grey)) / 255) ** 2)
 
 
