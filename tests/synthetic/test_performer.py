@@ -1,6 +1,7 @@
 """The synthetic capture: its ground truth is consistent, and its clothes go beyond the body model."""
 
 import hashlib
+import json
 from pathlib import Path
 
 import cv2
@@ -167,3 +168,8 @@ def test_irradiance_and_floor_shadow_under_an_open_sky() -> None:
     assert floor_shadow(roof, np.zeros(3), lights).min() < 0.2
     nothing = mesh_on_cpu(np.array([[0.0, 0, -5], [1, 0, -5], [0, 1, -5]]), np.array([[0, 1, 2]]))
     assert floor_shadow(nothing, np.zeros(3), lights).min() == pytest.approx(1.0)
+
+
+def test_keypoints_are_written_as_openpose_files(folder: Path) -> None:
+    stored = json.loads((folder / "openpose" / "01" / "000000_keypoints.json").read_text())
+    assert len(stored["people"]) == 1 and len(stored["people"][0]["pose_keypoints_2d"]) == 75

@@ -96,6 +96,14 @@ def test_undistort_inverts_k1_by_hand() -> None:
     assert straight[0, 1].tolist() == [7, 7, 0]
 
 
+def test_undistort_inverts_a_wide_lens_in_the_corner() -> None:
+    """The corner (0.9, 0.5) focal lengths off the axis, r^2 = 1.06: with k1 = -0.2 it appears at 1 - 0.212 of that."""
+    camera = Camera("01", np.array([[1000.0, 0, 900], [0, 1000, 500], [0, 0, 1]]), np.eye(3), np.zeros(3), 1801, 1001)
+    distorted = np.array([[[900 + 0.788 * 900, 500 + 0.788 * 500, 1.0]]])
+    straight = undistort(distorted, [camera], ["01"], -0.2)
+    np.testing.assert_allclose(straight[0, 0], [1800, 1000, 1], atol=0.02)
+
+
 def test_the_height_sets_the_scale() -> None:
     cameras, points = scale_to(ring(3), 2 * walk_m(), STATURE_M)
     assert np.allclose(points, walk_m(), atol=1e-3)  # 1.56 m leaves out the limbs' thickness
