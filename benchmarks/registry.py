@@ -114,8 +114,7 @@ REGISTRY = (
     measured("scaling-large", "scaling.py", "scaling-large", "performer", *LARGE, configs=("fast",)),
     measured("pixels-memory", "pixels_memory.py"),
     study("stability", "quick", "fast"),
-    study("stability", "brief", "fast"),
-    study("stability", "seeds", "fast"),
+    study("stability", "fast", "fast"),
     study("stability", "published", "fast", "neural-body"),
     ablations("fast"),
     ablations(
