@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from provenance import RESULTS, SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
-from flows.train_subject import prepare_training
+from flows.preparation import prepare_training
 from hnerf.config import Settings, TrainingSettings, load_settings
 from hnerf.study.benchmark.plan import ScoringSettings
 from tasks.benchmark import score_training

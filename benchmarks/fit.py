@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from provenance import SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
-from flows.train_subject import prepare_training, with_detections
+from flows.preparation import prepare_training, with_detections
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import joint_transforms
 from hnerf.config import load_settings

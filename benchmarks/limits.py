@@ -17,7 +17,7 @@ import numpy as np
 from fit import joint_errors
 from provenance import SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
-from flows.train_subject import prepare_training, with_detections
+from flows.preparation import prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.capture.keypoint_files import write_openpose
 from hnerf.config import load_settings

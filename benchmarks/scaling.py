@@ -20,7 +20,7 @@ from peak_memory import peak_mib, reset_peak
 from provenance import RESULTS, arguments, provenance, provenance_line, table, write_result
 from studies import capture_folder
 
-from flows.train_subject import segment_subject
+from flows.preparation import segment_subject
 from hnerf.capture.capture import Capture
 from hnerf.config import load_settings
 from hnerf.evenly_spaced import evenly_spaced

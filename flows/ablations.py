@@ -12,8 +12,8 @@ from typing import Any
 
 from prefect import flow
 
+from flows.preparation import prepare_training, with_detections
 from flows.run_page import publish_markdown, shown_progress
-from flows.train_subject import prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
 from hnerf.errors import InputError, one_line

@@ -8,23 +8,23 @@ from typing import Annotated, Any
 from prefect import flow
 from pydantic import Field
 
+from flows.preparation import Prepared, ingest_part, prepare_training
 from flows.run_page import publish_markdown, shown_progress
-from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
 from hnerf.evaluation.ground_truth import truth_of
 from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import is_flat, training_limits_s
-from hnerf.study.benchmark.plan import BenchmarkStudy, CapturePart, Variant, load_study
+from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
 from hnerf.study.benchmark.publish import publish, table_of
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated_capture
-from tasks.capture import ingest, subset_capture
+from tasks.capture import ingest
 from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
 from tasks.source import GROUND_TRUTH, Source, read_capture
-from tasks.store import Artifact, Store
+from tasks.store import Store
 from tasks.training import train
 
 log = logging.getLogger("hnerf.benchmark")
@@ -94,15 +94,6 @@ def describe_variant(variant: Variant, recorded: Capture) -> dict[str, Any]:
         return {"left_out": str(error)}
     counts = {"cameras": len(cameras or recorded.train_cameras), "frames": len(frames or recorded.train_frames)}
     return counts | {"methods": {}}
-
-
-def ingest_part(store: Store, source: Source, part: CapturePart, settings: Settings) -> Artifact:
-    """Ingest the recording, or the part of it that a study uses. The limits of these settings apply here and
-    afterwards."""
-    set_limits(settings.limits)
-    recording = with_detections(store, ingest(store, source, settings.capture), settings)
-    parts = part.select(Capture.load(recording.root))
-    return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
 
 
 def measure(

@@ -68,7 +68,7 @@ def _write_capture(out: Path, settings: SyntheticSettings) -> None:
 
 def check_cameras(options: argparse.Namespace) -> None:
     """Check the calibration of a capture, and print a verdict for each camera."""
-    from flows.train_subject import with_detections
+    from flows.preparation import with_detections
     from tasks.calibration import calibrate
     from tasks.capture import ingest
     from tasks.limits import set_limits

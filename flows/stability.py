@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from prefect import flow
 
-from flows.benchmark import ingest_part
+from flows.preparation import Prepared, ingest_part, prepare_training
 from flows.run_page import publish_markdown, shown_progress
-from flows.train_subject import Prepared, prepare_training
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from prefect import flow
 from prefect.client.schemas.objects import FlowRun, State
 
+from flows.preparation import segment_and_fit, segment_subject, with_detections
 from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
@@ -19,7 +20,6 @@ from tasks.asset import export
 from tasks.bucket import BucketError
 from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
-from tasks.detection import detect, find_hands, needs_detection, needs_hands
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.launcher import RankFailedError
@@ -27,7 +27,6 @@ from tasks.ledger import forget
 from tasks.limits import StalledError, set_limits
 from tasks.quarantine import clear, note_run
 from tasks.remote import NothingThereError, fetched, remote_capture
-from tasks.segmentation import converged, needs_body, segment
 from tasks.source import place, read_capture
 from tasks.store import OPTIONAL, Artifact, Store
 from tasks.training import train
@@ -35,15 +34,6 @@ from tasks.training import train
 log = logging.getLogger("hnerf.train")
 
 NOTED = (InputError, InvalidAsset, BucketError, RankFailedError, StalledError)  # their messages suffice
-
-
-class Prepared(NamedTuple):
-    """The results of earlier stages that training and evaluation take, in the order of these tasks' arguments."""
-
-    recording: Artifact
-    calibration: Artifact
-    segmentation: Artifact
-    body: Artifact
 
 
 class Trained(NamedTuple):
@@ -160,26 +150,6 @@ def local_folder(store: Store, capture: Path | str) -> Path:
     return fetched(store, found)
 
 
-def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
-    """Return the recording with people detected by a network, if it needs that, and with keypoints of the subject's
-    hands, if they are wanted and the network is installed."""
-    wanted, network = needs_detection(recorded, settings.detection), settings.detection
-    recording = detect(store, recorded, network.source, network.size) if wanted else recorded
-    return find_hands(store, recording) if needs_hands(recording, settings.detection) else recording
-
-
-def prepare_training(store: Store, recording: Artifact, settings: Settings) -> Prepared:
-    """Run the stages before training on a recording."""
-    return segment_and_fit(store, recording, calibrate(store, recording, settings.calibration), settings)
-
-
-def segment_and_fit(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Prepared:
-    """Run the stages between calibration and training."""
-    segmentation = segment_subject(store, recording, calibration, settings)
-    body = fit(store, recording, calibration, segmentation, settings.fit)
-    return Prepared(recording, calibration, segmentation, body)
-
-
 def calibrated_held_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:
     """Return the cameras to hold out in turn, among those that calibration kept."""
     if settings.evaluation.holdout is None:
@@ -198,20 +168,6 @@ def evaluate_without_camera(
     training = train(store, *prepared, settings.training)
     scored = (recording, calibration, segmentation, prepared.body, training)
     return evaluate_held_out(store, *scored, camera, settings.evaluation)
-
-
-def segment_subject(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:
-    """Segment the person. If that needs a body, fit one to keypoints first, and alternate until the masks converge."""
-    if not needs_body(recording, settings.segmentation):
-        return segment(store, recording, calibration, None, None, settings.segmentation)
-    segmentation = None
-    for _ in range(settings.segmentation.rounds):
-        body = fit(store, recording, calibration, segmentation, settings.fit)
-        segmentation = segment(store, recording, calibration, body, segmentation, settings.segmentation)
-        if converged(segmentation, settings.segmentation):
-            break
-    assert segmentation is not None  # there is at least one round
-    return segmentation
 
 
 def _key_pictures(calibration: Artifact, evaluation: Artifact) -> list[tuple[str, Path]]:

@@ -68,8 +68,8 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
     of points.
     """
     of_25 = [points.reshape(-1, 25, 3) for points in detections.values() if points.shape[-2] == 25]
-    of_face = not of_25 or is_body_25(np.concatenate(of_25))
-    by_count = {known.points: known for known in SETS.values()} | {25: SETS["body_25" if of_face else "body_25b"]}
+    set_of_25: KeypointSetName = "body_25" if not of_25 or is_body_25(np.concatenate(of_25)) else "body_25b"
+    by_count = {known.points: known for known in SETS.values()} | {25: SETS[set_of_25]}
     found = {}
     for camera, points in detections.items():
         count = points.shape[-2]

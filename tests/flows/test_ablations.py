@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from flows import ablations as module
-from flows import run_page, train_subject
+from flows import preparation, run_page
 from flows.ablations import ablate, as_markdown, choose
 from flows.cli import main
 from hnerf.config import TrainingSettings, load_settings
@@ -57,7 +57,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
         return SimpleNamespace(root=tmp_path)
 
     for name in ("calibrate", "segment_subject", "fit"):
-        monkeypatch.setattr(train_subject, name, lambda *_: None)
+        monkeypatch.setattr(preparation, name, lambda *_: None)
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
     monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
     monkeypatch.setattr(

@@ -3,13 +3,13 @@
 import base64
 import json
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 
 from flows import benchmark as module
-from flows import run_page, train_subject
+from flows import preparation, run_page
 from flows.benchmark import benchmark
 from flows.cli import main
 from hnerf.config import TrainingSettings
@@ -75,11 +75,12 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
         return SimpleNamespace(root=folder)
 
     for name in ("calibrate", "segment_subject"):
-        monkeypatch.setattr(train_subject, name, lambda *_: None)
-    monkeypatch.setattr(train_subject, "fit", lambda *_: "body")
-    monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
-    monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
-    monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
+        monkeypatch.setattr(preparation, name, lambda *_: None)
+    monkeypatch.setattr(preparation, "fit", lambda *_: "body")
+    for place in (preparation, module):
+        monkeypatch.setattr(place, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
+    monkeypatch.setattr(preparation, "with_detections", lambda store, recording, settings: recording)
+    monkeypatch.setattr(preparation, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
     truth = SimpleNamespace(root=tmp_path)
     monkeypatch.setattr(
         module, "read_capture", lambda folder, _: (SimpleNamespace(root=folder, digest=str(folder)), truth)
@@ -215,18 +216,18 @@ def test_a_failed_method_holds_its_error_and_the_others_are_trained(
 
 
 @pytest.mark.usefixtures("without_charts")
-@pytest.mark.parametrize("stage", ["subset_capture", "score_training"])
+@pytest.mark.parametrize(("place", "stage"), [(preparation, "subset_capture"), (module, "score_training")])
 def test_a_failure_in_subset_or_scoring_affects_one_method_only(
-    stages: Stages, study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+    stages: Stages, study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: ModuleType, stage: str
 ) -> None:
-    good = getattr(module, stage)
+    good = getattr(place, stage)
 
     def broken(*inputs: Any) -> Any:
         if stages[-1][1].field.kind == "fast":
             raise ValueError("the surface is empty")
         return good(*inputs)
 
-    monkeypatch.setattr(module, stage, broken)
+    monkeypatch.setattr(place, stage, broken)
     variants = read(benchmark.fn(tmp_path, study, store=tmp_path / "store"))["variants"]
     assert variants["one frame"]["methods"]["fast"] == {"error": "the surface is empty"}
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from flows import preparation
 from flows import train_subject as module
 from flows.cli import main
 from flows.train_subject import train_subject
@@ -54,12 +55,14 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any
         write.__signature__ = inspect.signature(stage.write)  # type: ignore[attr-defined]
         return Stage(write, stage.name, "test", resumable=False)
 
-    for name in ("ingest", "calibrate", "segment", "fit", "train", "evaluate", "evaluate_held_out", "export"):
-        monkeypatch.setattr(module, name, spied(getattr(module, name)))
-    monkeypatch.setattr(module, "needs_body", lambda *_: True)
-    monkeypatch.setattr(module, "needs_detection", lambda *_: False)
-    monkeypatch.setattr(module, "needs_hands", lambda *_: False)
-    monkeypatch.setattr(module, "converged", lambda *_: True)
+    stages = {"ingest", "calibrate", "segment", "fit", "train", "evaluate", "evaluate_held_out", "export"}
+    for place in (preparation, module):
+        for name in stages & set(vars(place)):
+            monkeypatch.setattr(place, name, spied(getattr(place, name)))
+    monkeypatch.setattr(preparation, "needs_body", lambda *_: True)
+    monkeypatch.setattr(preparation, "needs_detection", lambda *_: False)
+    monkeypatch.setattr(preparation, "needs_hands", lambda *_: False)
+    monkeypatch.setattr(preparation, "converged", lambda *_: True)
     (tmp_path / "ada").mkdir()
     whole = write_recording(tmp_path / "whole")
     write_easymocap(tmp_path / "ada", [pinhole(camera) for camera in whole.cameras.values()])

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from flows import benchmark, run_page, train_subject
+from flows import preparation, run_page
 from flows import stability as module
 from flows.cli import main
 from flows.stability import stability
@@ -111,7 +111,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         "show_in_extreme_poses": show,
     }
     for name, stage in replaced.items():
-        for place in (module, benchmark, train_subject):  # `ingest_part` and `prepare_training` are in the other two
+        for place in (module, preparation):
             if hasattr(place, name):
                 monkeypatch.setattr(place, name, stage)
     capture = SimpleNamespace(name="ada", test_cameras=("c",), novel_pose_frames=(1, 3, 4))
@@ -131,7 +131,7 @@ def study(tmp_path: Path, **options: Any) -> dict[str, Any]:
 def test_the_recording_is_read_within_the_limits_of_the_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "large.yaml").write_text("based_on: fast\nlimits: {reader_gib: 64}")
     (tmp_path / "mine.yaml").write_text(STUDY)
-    monkeypatch.setattr(benchmark, "ingest", lambda *_: pytest.fail(f"{current_limits().reader_gib:g} GiB"))
+    monkeypatch.setattr(preparation, "ingest", lambda *_: pytest.fail(f"{current_limits().reader_gib:g} GiB"))
     with pytest.raises(pytest.fail.Exception, match=r"^64 GiB"):
         stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", [str(tmp_path / "large.yaml")])
 
@@ -265,7 +265,7 @@ def test_a_study_of_a_part_uses_only_that_part_of_the_capture(
         assert (recording.name, parts) == ("capture", (None, (2,), ()))
         return SimpleNamespace(root=tmp_path, name="moment")
 
-    monkeypatch.setattr(benchmark, "subset_capture", subset_capture)
+    monkeypatch.setattr(preparation, "subset_capture", subset_capture)
     part = "part: {frames: 1, novel_poses: false}"
     (tmp_path / "mine.yaml").write_text(STUDY.replace("seeds: [0, 1]", f"seeds: [0]\n{part}"))
     found = study(tmp_path, only=["pose_noise"])

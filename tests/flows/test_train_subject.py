@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from fsspec import filesystem
 
+from flows import preparation
 from flows import train_subject as module
 from flows.train_subject import train_subject
 from hnerf.capture.capture import Capture
@@ -25,11 +26,12 @@ STAGES = ("ingest", "detect", "find_hands", "calibrate", "segment", "fit", "trai
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write a capture folder and replace every stage of the flow."""
-    for name in STAGES:
-        monkeypatch.setattr(module, name, _recording(getattr(module, name), tmp_path))
-    monkeypatch.setattr(module, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
-    monkeypatch.setattr(module, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
-    monkeypatch.setattr(module, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
+    for place in (preparation, module):
+        for name in set(STAGES) & set(vars(place)):
+            monkeypatch.setattr(place, name, _recording(getattr(place, name), tmp_path))
+    monkeypatch.setattr(preparation, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
+    monkeypatch.setattr(preparation, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
+    monkeypatch.setattr(preparation, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
     (tmp_path / "ada").mkdir()
     return tmp_path / "ada"
 
@@ -105,14 +107,15 @@ def test_stages_that_a_run_skips_are_not_linked(folder: Path, tmp_path: Path) ->
 
 
 def test_the_store_knows_every_stage_that_a_subject_links_to() -> None:
-    assert [getattr(module, name).name for name in STAGES] == list(store.STAGES)
+    flow = vars(preparation) | vars(module)
+    assert [flow[name].name for name in STAGES] == list(store.STAGES)
 
 
 def test_without_masks_or_plates_a_rough_fit_precedes_segmentation(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "bare").touch()
-    monkeypatch.setattr(module, "converged", lambda *_: True)
+    monkeypatch.setattr(preparation, "converged", lambda *_: True)
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert given(subject, "segmentation") == ["capture", "calibration", "fit"]
     assert given(subject, "fit") == ["capture", "calibration", "segmentation"]
@@ -124,7 +127,7 @@ def test_fit_and_segmentation_alternate_until_the_masks_converge(
 ) -> None:
     (folder / "bare").touch()
     answers = iter([False, True])
-    monkeypatch.setattr(module, "converged", lambda *_: next(answers))
+    monkeypatch.setattr(preparation, "converged", lambda *_: next(answers))
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert given(subject, "segmentation") == ["capture", "calibration", "fit", "segmentation"]
     assert next(answers, None) is None
@@ -134,7 +137,7 @@ def test_fit_and_segmentation_alternate_until_the_masks_converge(
 def test_the_number_of_rounds_is_limited(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "bare").touch()
     asked = []
-    monkeypatch.setattr(module, "converged", lambda *_: bool(asked.append(1)))
+    monkeypatch.setattr(preparation, "converged", lambda *_: bool(asked.append(1)))
     train_subject.fn(folder, "demo", tmp_path / "store", ["segmentation.rounds=2"])
     assert len(asked) == 2
 

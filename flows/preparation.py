@@ -1,0 +1,67 @@
+"""The stages before training, which `train-subject` and the studies have in common."""
+
+from typing import NamedTuple
+
+from hnerf.capture.capture import Capture
+from hnerf.config import Settings
+from hnerf.study.benchmark.plan import CapturePart
+from tasks.calibration import calibrate
+from tasks.capture import ingest, subset_capture
+from tasks.detection import detect, find_hands, needs_detection, needs_hands
+from tasks.fit import fit
+from tasks.limits import set_limits
+from tasks.segmentation import converged, needs_body, segment
+from tasks.source import Source
+from tasks.store import Artifact, Store
+
+
+class Prepared(NamedTuple):
+    """The results of earlier stages that training and evaluation take, in the order of these tasks' arguments."""
+
+    recording: Artifact
+    calibration: Artifact
+    segmentation: Artifact
+    body: Artifact
+
+
+def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
+    """Return the recording with people detected by a network, if it needs that, and with keypoints of the subject's
+    hands, if they are wanted and the network is installed."""
+    wanted, network = needs_detection(recorded, settings.detection), settings.detection
+    recording = detect(store, recorded, network.source, network.size) if wanted else recorded
+    return find_hands(store, recording) if needs_hands(recording, settings.detection) else recording
+
+
+def ingest_part(store: Store, source: Source, part: CapturePart, settings: Settings) -> Artifact:
+    """Ingest the recording, or the part of it that a study uses. The limits of these settings apply here and
+    afterwards."""
+    set_limits(settings.limits)
+    recording = with_detections(store, ingest(store, source, settings.capture), settings)
+    parts = part.select(Capture.load(recording.root))
+    return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
+
+
+def prepare_training(store: Store, recording: Artifact, settings: Settings) -> Prepared:
+    """Run the stages before training on a recording."""
+    return segment_and_fit(store, recording, calibrate(store, recording, settings.calibration), settings)
+
+
+def segment_and_fit(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Prepared:
+    """Run the stages between calibration and training."""
+    segmentation = segment_subject(store, recording, calibration, settings)
+    body = fit(store, recording, calibration, segmentation, settings.fit)
+    return Prepared(recording, calibration, segmentation, body)
+
+
+def segment_subject(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:
+    """Segment the person. If that needs a body, fit one to keypoints first, and alternate until the masks converge."""
+    if not needs_body(recording, settings.segmentation):
+        return segment(store, recording, calibration, None, None, settings.segmentation)
+    segmentation = None
+    for _ in range(settings.segmentation.rounds):
+        body = fit(store, recording, calibration, segmentation, settings.fit)
+        segmentation = segment(store, recording, calibration, body, segmentation, settings.segmentation)
+        if converged(segmentation, settings.segmentation):
+            break
+    assert segmentation is not None  # there is at least one round
+    return segmentation
