@@ -23,8 +23,8 @@ class Result:
     command: a program under benchmarks/ and its arguments. In these, {store} is the store of all results; {new} is a
     folder that no other result and no other version of the code uses, for programs that time all of their work. files:
     patterns under benchmarks/results/; captures: names under ../shared/data; configs: patterns under configs/ without
-    ".yaml"; runs: modules that the program starts but does not import; threads: used by the program; gpu: whether it
-    needs one.
+    ".yaml"; runs: modules that the program starts, or imports by a computed name; threads: used by the program; gpu:
+    whether it needs one.
     """
 
     name: str
@@ -82,7 +82,8 @@ def study(
     command += tuple(f"--synth={setting}" for setting in synth)
     captures = () if synth else (capture,)
     files = (f"{title}.*", f"{title}-*.png")
-    return Result(title, command, files, captures, (f"{kind}/{name}", *methods), threads=threads)
+    runs = (f"flows.{kind}",)
+    return Result(title, command, files, captures, (f"{kind}/{name}", *methods), runs, threads)
 
 
 def ablations(preset: str, *changes: str, rows: tuple[str, ...] = ()) -> Result:
@@ -92,7 +93,8 @@ def ablations(preset: str, *changes: str, rows: tuple[str, ...] = ()) -> Result:
     command += tuple(f"--set={change}" for change in changes)
     command += ("--methods", ",".join(f"no-{row}" for row in rows)) if rows else ()
     title = f"ablations/valid-wave-{preset}{'-part' if rows else ''}"
-    return Result(title, command, (f"{title}.*",), ("valid-wave",), (preset, "ablations/*"))
+    configs = (preset, "ablations/*")
+    return Result(title, command, (f"{title}.*",), ("valid-wave",), configs, ("flows.ablations",))
 
 
 REGISTRY = (

@@ -110,8 +110,10 @@ def test_entries_have_unique_names_and_existing_programs_and_settings() -> None:
             assert any((ROOT / "configs").glob(f"{pattern}.yaml")), f"{result.name}: no configs/{pattern}.yaml"
 
 
-def test_sources_of_a_study_include_those_of_training() -> None:
+def test_sources_of_a_study_include_those_of_training_and_neither_the_asset_nor_other_studies() -> None:
     study = next(result for result in REGISTRY if result.name == "benchmark/valid-wave-static")
     names = {str(path.relative_to(ROOT)) for path in sources(ROOT, study)}
     assert {"hnerf/training/run.py", "tasks/rank.py", "hnerf/baselines/idr.py", "benchmarks/provenance.py"} <= names
-    assert "benchmarks/segmentation.py" not in names
+    assert "flows/benchmark.py" in names
+    assert not names & {"benchmarks/segmentation.py", "flows/stability.py", "flows/ablations.py"}
+    assert [name for name in names if name.startswith("hnerf/asset/")] == []
