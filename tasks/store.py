@@ -34,7 +34,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field, FiniteFloat
 
-from hnerf.errors import InputError, PlaceError
+from hnerf.errors import DISK_FULL, InputError, PlaceError
 from hnerf.files import atomic_file, made_folder, replace_text
 from tasks.pins import pin, unless_read_only
 
@@ -167,6 +167,8 @@ class Store:
             try:
                 metrics = write(partial)
             except BaseException as error:
+                if isinstance(error, OSError) and error.errno in DISK_FULL and error.filename is None:
+                    error.filename = str(self.root)
                 if not resumable or (isinstance(error, InputError) and not isinstance(error, PlaceError)):
                     remove(partial)
                 raise

@@ -69,6 +69,15 @@ def test_half_written_artifact_is_not_seen(tmp_path: Path, error: BaseException)
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("named", "told"), [(None, "{store}"), ("/elsewhere/a.png", "/elsewhere/a.png")])
+def test_a_full_disk_is_told_with_a_path(tmp_path: Path, named: str | None, told: str) -> None:
+    def write(out: Path) -> dict[str, float]:
+        raise OSError(errno.ENOSPC, "No space left on device", named)
+
+    with pytest.raises(OSError, match=f"No space left on device: '{told.format(store=tmp_path)}'$"):
+        Store(tmp_path).get_or_compute("fit", "k", write)
+
+
 def test_a_vanished_store_does_not_hide_the_original_error(tmp_path: Path) -> None:
     """The original error is raised, so that it can be retried; that the folder is already gone does not hide it."""
 
