@@ -51,8 +51,8 @@ def main() -> None:
     kept.mkdir(parents=True, exist_ok=True)
     name = table.stem if options.kind == "ablations" else table.stem.removesuffix("-part")
     for path in [*table.parent.glob(f"{table.stem}.*"), *table.parent.glob(f"{table.stem}-*.png")]:
-        if "-part" in path.stem.removeprefix(table.stem):  # belongs to a part of the study, not to the whole
-            continue
+        if path.suffix == ".recording" or "-part" in path.stem.removeprefix(table.stem):
+            continue  # says which folder was studied, or belongs to a part of the study
         shutil.copy(path, kept / path.name.replace(table.stem, name))
     text = f"{table.read_text().replace(table.stem, name)}\nMade by `benchmarks/studies.py`: {where}\n"
     (kept / f"{name}.md").write_text(text)
