@@ -18,7 +18,6 @@ from hnerf.training.step import TrainingError
 RAYS = 2048
 MIN_PERSON_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
 MAX_BACKGROUND_COVERAGE = 0.8  # of the background pixels; above it the surface fills the box
-MIN_CLEAR_RAYS = 32  # of RAYS; fewer tell nothing, since masks miss some of what is there
 MIN_SAMPLES_PER_RAY = 64  # through a whole scene: valid-wave's body covers 38 % with 16, 59 % with 64, 64 % with 256
 
 
@@ -42,15 +41,15 @@ class FixedRays:
     @torch.no_grad()
     def require_surface(self, scene: PosedScene[Any], rows: Tensor) -> None:
         """Raise TrainingError if the surface is empty or fills the box. Of the background, only rays through the box
-        count. Those near outlines, which blurred surfaces cover, are left out if enough others remain: a tight shell
-        meets hardly any others."""
+        count. A blurred surface covers those near outlines, and a sound one those through holes in masks, which are
+        most of the others in a tight shell: it fills the box if it covers all, and those away from outlines."""
         count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
         rays, samples = self.sample(scene, rows, count)
         coverage = self.field.coverage(samples)
         beside = ~rays.person & (samples.in_box > 0).any(1)
         clear = beside & ~rays.edge
         person = coverage[rays.person].mean()
-        around = coverage[clear if int(clear.sum()) >= MIN_CLEAR_RAYS else beside].mean()
+        around = min(coverage[beside].mean(), coverage[clear if clear.any() else beside].mean())
         if not person >= MIN_PERSON_COVERAGE:  # also true for NaN
             raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
         if around > MAX_BACKGROUND_COVERAGE:

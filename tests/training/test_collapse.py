@@ -86,6 +86,22 @@ def test_a_single_pixel_away_from_outlines_does_not_decide(tmp_path: Path, monke
     trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
 
 
+def test_holes_in_masks_are_not_taken_for_surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Every second pixel of the person is labelled as background away from outlines, and the background as outline."""
+    monkeypatch.setattr(fixed_rays, "RAYS", 512)
+    trainer = trainer_of(tmp_path, "fast")
+    sample = trainer.fixed_rays.sample
+
+    def with_holes(*given: Any) -> Any:
+        rays, samples = sample(*given)
+        holes, edge, person = torch.nonzero(rays.person)[::2, 0], ~rays.person, rays.person.clone()
+        edge[holes], person[holes] = False, False
+        return dataclasses.replace(rays, edge=edge, person=person), samples
+
+    monkeypatch.setattr(fixed_rays.FixedRays, "sample", lambda _, *given: with_holes(*given))
+    trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
+
+
 def test_a_nan_distance_counts_as_an_empty_surface(tmp_path: Path):
     trainer = trainer_of(tmp_path, "fast")
     move_surface(trainer.field, float("nan"))
