@@ -41,8 +41,8 @@ class FixedRays:
     @torch.no_grad()
     def require_surface(self, scene: PosedScene[Any], rows: Tensor) -> None:
         """Raise TrainingError if the surface is empty or fills the box. Of the background, only rays through the box
-        count. A blurred surface covers those near outlines, and a sound one those through holes in masks, which are
-        most of the others in a tight shell: it fills the box if it covers all, and those away from outlines."""
+        count. A sound surface may cover those near outlines, if it is blurred, or those away from outlines, which in a
+        tight shell are mostly rays through holes in masks. One that fills the box covers both."""
         count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
         rays, samples = self.sample(scene, rows, count)
         coverage = self.field.coverage(samples)

@@ -102,6 +102,24 @@ def test_holes_in_masks_are_not_taken_for_surroundings(tmp_path: Path, monkeypat
     trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
 
 
+def test_a_surface_that_covers_outlines_alone_does_not_fill_the_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Every second pixel of the person is labelled as outline, and only five pixels beside it as background."""
+    monkeypatch.setattr(fixed_rays, "RAYS", 512)
+    trainer = trainer_of(tmp_path, "fast")
+    sample = trainer.fixed_rays.sample
+
+    def with_wide_outlines(*given: Any) -> Any:
+        rays, samples = sample(*given)
+        outline = torch.nonzero(rays.person)[::2, 0]
+        beside = torch.nonzero(~rays.person & (samples.in_box > 0).any(1))[:, 0]
+        edge, person = torch.zeros_like(rays.edge), rays.person.clone()
+        edge[outline], person[outline], person[beside[5:]] = True, False, True
+        return dataclasses.replace(rays, edge=edge, person=person), samples
+
+    monkeypatch.setattr(fixed_rays.FixedRays, "sample", lambda _, *given: with_wide_outlines(*given))
+    trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
+
+
 def test_a_nan_distance_counts_as_an_empty_surface(tmp_path: Path):
     trainer = trainer_of(tmp_path, "fast")
     move_surface(trainer.field, float("nan"))
