@@ -4,12 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.avatar.trained import build_field
 from hnerf.baselines.idr import SdfNetwork, intersection, trace_surface
 from hnerf.config import load_settings
-from hnerf.errors import InputError
 from hnerf.fields.rays import Rays
-from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
+from tests.baselines.ball import RADIUS_M, RING, inner_psnr, psnr, radii_m, trained
 
 SMALL = [
     "training.steps=150",
@@ -134,8 +132,3 @@ def test_two_opposite_views_do_not_determine_the_depth_between(tmp_path: Path) -
     avatar = trained(tmp_path, load_settings("idr", SMALL + FEWER).training, ("0", "4"))
     assert psnr(avatar, tmp_path, "0") > 20
     assert psnr(avatar, tmp_path, "2") < psnr(avatar, tmp_path, "0") - 4
-
-
-def test_more_than_one_moment_is_refused() -> None:
-    with pytest.raises(InputError, match="IDR models one moment"):
-        build_field(load_settings("idr").training.field, body(), static=False)

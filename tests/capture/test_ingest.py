@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 
 from hnerf.capture.capture import Capture, write_image
-from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
@@ -264,14 +263,6 @@ def test_keypoint_files_may_have_the_names_that_openpose_gives_them(folder: Path
     for path in folder.glob("openpose/*/*"):
         path.rename(path.with_name(f"{prefix}{int(path.stem[:6]):012d}_keypoints.json"))
     assert np.array_equal(ingest(folder, SETTINGS, tmp_path / "out").keypoints("01"), plain)
-
-
-def test_numbers_without_leading_zeros_are_sorted_as_numbers(tmp_path: Path) -> None:
-    folder = rec.write_pose2sim(tmp_path / "walker")
-    for path in (folder / "pose" / "cam01_json").iterdir():
-        path.rename(path.with_stem(f"cam01_{int(path.stem[-6:]) + 5}"))  # 5 to 14
-    files = Pose2Sim(folder).keypoint_files("cam01")
-    assert [str(files[i]).rsplit("_", 1)[1] for i in (0, 4, 5, 9)] == ["5.json", "9.json", "10.json", "14.json"]
 
 
 def test_videos_are_read_by_frame(tmp_path: Path) -> None:

@@ -184,6 +184,10 @@ def test_f_has_no_root_input_without_the_root_condition() -> None:
     field = field_of(root_condition=False)
     sampled(field)
     assert field.radiance.asked[-1][2].shape == (8, 0)
+    for condition, inputs in ((True, 256 + 12 + 3), (False, 256 + 3)):
+        settings = PaperFieldSettings(samples=8, root_condition=condition)
+        radiance = PaperField(RIG, torch.eye(4)[None], settings, static=False).radiance
+        assert radiance.colour[0].in_features == inputs
 
 
 def test_the_static_form_has_only_the_position_as_input() -> None:

@@ -62,10 +62,12 @@ def test_studies_show_their_progress(study: Flow[..., Path], tmp_path: Path, mon
 
 
 def test_an_unreachable_server_does_not_end_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_page, "create_progress_artifact", Mock(side_effect=ConnectionError("no server")))
+    create = Mock(side_effect=ConnectionError("no server"))
+    monkeypatch.setattr(run_page, "create_progress_artifact", create)
     page = run_page._ProgressPage()
     page.next_s["fit"] = 0.0
     page.show(run_page.Progress("fit", 1, 2))
+    create.assert_called_once()
 
 
 def test_images_are_shrunk_and_embedded(tmp_path: Path) -> None:

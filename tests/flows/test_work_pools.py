@@ -7,12 +7,16 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID
 
+import kubernetes_validate
 import pytest
+from docker.types import HostConfig
 from jsonschema import Draft202012Validator
 from prefect.client.schemas.actions import WorkPoolCreate
 from prefect.client.schemas.objects import FlowRun
 from prefect.utilities.templating import find_placeholders
 from prefect.workers.base import BaseJobConfiguration, BaseWorker
+from prefect_docker.worker import DockerWorker
+from prefect_kubernetes.worker import KubernetesWorker
 
 POOLS = Path(__file__).parents[2] / "configs" / "work_pools"
 RUN = FlowRun(id=UUID(int=7), flow_id=UUID(int=8), name="captures/Ada #1")
@@ -33,8 +37,7 @@ def prepared(worker: type[BaseWorker], **values: object) -> BaseJobConfiguration
 
 def manifest(**values: object) -> dict[str, Any]:
     """Return the manifest of a job, without the keys that Prefect puts in the wrong place (NOT_OURS)."""
-    module = pytest.importorskip("prefect_kubernetes.worker", reason="prefect-kubernetes is not installed")
-    made: dict[str, Any] = prepared(module.KubernetesWorker, **values).job_manifest
+    made: dict[str, Any] = prepared(KubernetesWorker, **values).job_manifest
     pod = made["spec"]["template"]["spec"]
     made["spec"]["template"]["spec"] = {key: value for key, value in pod.items() if key not in NOT_OURS}
     return made
@@ -42,9 +45,8 @@ def manifest(**values: object) -> dict[str, Any]:
 
 def validate(job: dict[str, Any]) -> None:
     """Raise ValidationError if the manifest does not match the schema or has unknown keys."""
-    schemas = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate is not installed")
-    for version in ("1.28", schemas.latest_version()):
-        schemas.validate(job, version, strict=True)
+    for version in ("1.28", kubernetes_validate.latest_version()):
+        kubernetes_validate.validate(job, version, strict=True)
 
 
 @pytest.mark.parametrize("pool", ["docker", "kubernetes"])
@@ -59,15 +61,12 @@ def test_variables_are_declared_and_used(pool: str) -> None:
 @pytest.mark.parametrize(
     ("worker", "replaced"),
     [
-        ("prefect_docker.worker.DockerWorker", {"command", "memswap_limit", "privileged", "container_create_kwargs"}),
-        ("prefect_kubernetes.worker.KubernetesWorker", {"cpu_request", "memory_request"}),
+        (DockerWorker, {"command", "memswap_limit", "privileged", "container_create_kwargs"}),
+        (KubernetesWorker, {"cpu_request", "memory_request"}),
     ],
 )
-def test_templates_have_the_variables_of_the_installed_prefect(worker: str, replaced: set[str]) -> None:
-    name, _, kind = worker.rpartition(".")
-    module = pytest.importorskip(name, reason=f"{name} is not installed")
-    default = getattr(module, kind).get_default_base_job_template()
-    ours = template(getattr(module, kind).type)
+def test_templates_have_the_variables_of_the_installed_prefect(worker: type[BaseWorker], replaced: set[str]) -> None:
+    default, ours = worker.get_default_base_job_template(), template(worker.type)
     assert set(ours["job_configuration"]) == set(default["job_configuration"])
     assert set(default["variables"]["properties"]) - set(ours["variables"]["properties"]) == replaced
 
@@ -99,9 +98,8 @@ def test_variables_reach_the_job() -> None:
 
 def docker_settings(**values: object) -> dict[str, Any]:
     """Return the container settings that the worker sends to Docker."""
-    module = pytest.importorskip("prefect_docker.worker", reason="prefect-docker is not installed")
-    job = prepared(module.DockerWorker, env={"PREFECT_API_URL": "https://example.org/api"}, **values)
-    return module.DockerWorker._build_container_settings(None, None, job)  # type: ignore[no-any-return]
+    job = prepared(DockerWorker, env={"PREFECT_API_URL": "https://example.org/api"}, **values)
+    return DockerWorker._build_container_settings(None, None, job)  # type: ignore[no-any-return]
 
 
 def test_docker_containers_get_a_gpu_limits_and_the_folders_of_the_checkout(
@@ -113,8 +111,7 @@ def test_docker_containers_get_a_gpu_limits_and_the_folders_of_the_checkout(
     assert (asked["mem_limit"], asked["memswap_limit"], asked["cpuset_cpus"]) == ("16g", "16g", "0-3")
     here = os.path.realpath(tmp_path)
     assert asked["volumes"] == [f"{here}/{name}:/srv/hnerf/{name}" for name in ("store", "captures")]
-    types = pytest.importorskip("docker.types")
-    host = types.HostConfig(version="1.43", device_requests=asked["device_requests"], mem_limit=asked["mem_limit"])
+    host = HostConfig(version="1.43", device_requests=asked["device_requests"], mem_limit=asked["mem_limit"])
     (gpu,) = host["DeviceRequests"]
     assert (gpu["Count"], gpu["Capabilities"], host["Memory"]) == (1, [["gpu"]], 16 * 2**30)
 

@@ -1,14 +1,8 @@
-import dataclasses
-from pathlib import Path
-
 import numpy as np
-import pytest
 
-from hnerf.capture.subject import subject_keypoints
-from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import _best_pair, solve_points, triangulate
-from tests.calibration.synthetic import detections, ring, walk_m, write_capture
+from tests.calibration.synthetic import detections, ring, walk_m
 
 
 def test_two_cameras_by_hand() -> None:
@@ -86,49 +80,3 @@ def test_noise_averages_out() -> None:
     keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=2).values()])
     points_m, _, _ = triangulate(np.stack([c.projection for c in cameras]), keypoints)
     assert np.median(np.linalg.norm(points_m - walk_m().reshape(-1, 3), axis=1)) < 0.010
-
-
-@pytest.mark.parametrize(("stride", "missed"), [(1, slice(4, 7)), (5, slice(0))])
-@pytest.mark.parametrize(("cameras", "surer_in"), [(1, 0), (3, 0), (4, 0), (4, 2)])
-def test_a_bystander_is_not_taken_for_the_subject(
-    tmp_path: Path, cameras: int, surer_in: int, stride: int, missed: slice
-) -> None:
-    """The subject moves by 13 % of their height per frame, or by half of it. A bystander is some metres away, or nearer
-    and detected with more confidence, but by only two of four cameras. With the smaller moves, the first camera misses
-    the subject for three frames. The order of people differs between images."""
-    rig, order = ring(cameras), stride * np.arange(12) % 12
-    both, expected = {}, {}
-    for i, camera in enumerate(rig):
-        uv = camera.project(walk_m()[0] + ([1.5, 0.5, 0] if surer_in else [-2.5, 1.6, 0]))[0]
-        confidence = 0.95 * (i < surer_in) if surer_in else 0.8
-        other = np.broadcast_to(np.concatenate([uv, np.full((25, 1), confidence)], 1), (12, 1, 25, 3))
-        subject = detections(rig, noise_px=1)[camera.name][order]
-        if camera.name == "c0":
-            subject[missed] = 0
-        both[camera.name], expected[camera.name] = np.concatenate([subject, other], 1), subject[:, 0]
-        both[camera.name][i::3] = both[camera.name][i::3, ::-1]
-    chosen = subject_keypoints(write_capture(tmp_path, rig, both))
-    for name, keypoints in expected.items():
-        np.testing.assert_array_equal(chosen[name], keypoints)
-
-
-def test_one_camera_takes_the_largest_and_most_central_person(tmp_path: Path) -> None:
-    camera = ring(4)[0]
-    subject = detections([camera], noise_px=1)["c0"]
-    small = subject * [0.4, 0.4, 1]  # towards the upper left corner, at the same confidence
-    chosen = subject_keypoints(write_capture(tmp_path, [camera], {"c0": np.concatenate([small, subject], 1)}))
-    np.testing.assert_array_equal(chosen["c0"], subject[:, 0])
-
-
-def test_test_cameras_are_never_read(tmp_path: Path) -> None:
-    cameras = ring(4)
-    capture = write_capture(tmp_path, cameras, {c: k for c, k in detections(cameras, 1).items() if c != "c3"})
-    capture = dataclasses.replace(capture, train_cameras=("c0", "c1", "c2"), test_cameras=("c3",))
-    assert set(subject_keypoints(capture)) == {"c0", "c1", "c2"}
-
-
-def test_a_person_seen_by_only_one_camera_is_refused(tmp_path: Path) -> None:
-    cameras = ring(3)
-    seen = {name: k * [1, 1, name == "c0"] for name, k in detections(cameras, 1).items()}
-    with pytest.raises(InputError, match="no person"):
-        subject_keypoints(write_capture(tmp_path, cameras, seen))

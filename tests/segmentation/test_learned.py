@@ -11,7 +11,7 @@ from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.segment import segment
-from tests.segmentation.scene import PERSON_RGB, write_scene
+from tests.segmentation.scene import write_scene
 
 
 def write_network(path: Path, shape: list, gain: float = 50.0) -> Path:
@@ -54,7 +54,6 @@ def test_the_subject_is_chosen_among_the_people_that_the_network_finds(tmp_path:
     settings = SegmentationSettings(model=write_network(tmp_path / "n.onnx", [1, 3, "H", "W"]))
     masks = segment(capture, None, settings)
     assert masks.report["cameras"]["c0"]["backend"] == "learned model"
-    assert PERSON_RGB[2] - PERSON_RGB[0] > 0.3 * 255
     for view, mask in truth.items():
         found = masks.get(*view)
         assert (found & mask).sum() / (found | mask).sum() > 0.97

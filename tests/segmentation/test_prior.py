@@ -11,6 +11,7 @@ from hnerf.segmentation.prior import (
     _consistent_keypoints,
     _interpolated,
     _stick_figure,
+    bounding_window,
     camera_priors,
 )
 from tests.calibration.synthetic import SIZE_PX, detections, edited_keypoints, ring, turned, write_capture
@@ -18,6 +19,13 @@ from tests.segmentation.scene import write_likely, write_scene
 
 HEAD, LEGS, FEET = [0, 15, 16, 17, 18], [10, 11, 13, 14, *range(19, 25)], list(range(19, 25))
 HIPS = [8, 9, 12]
+
+
+def test_the_window_of_a_region_has_a_margin_of_12_px_within_the_image() -> None:
+    region = np.zeros((60, 50), bool)
+    assert bounding_window(region) == (slice(0), slice(0))
+    region[20:23, 5:8] = True
+    assert bounding_window(region) == (slice(8, 35), slice(0, 20))
 
 
 @pytest.mark.parametrize(

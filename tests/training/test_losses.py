@@ -159,13 +159,13 @@ def test_elastic():
     assert losses.elastic(replace(SAMPLES, elastic=None)).item() == 0
 
 
-@pytest.mark.parametrize("name", ["reconstruction", "mask", "eikonal", "residual"])
+@pytest.mark.parametrize("name", ["reconstruction", "mask", "fog", "eikonal", "residual"])
 def test_gradients_in_double_precision(name: str):
     def loss(alpha, residual, norms):
         samples = replace(double, alpha=alpha, residual=residual, gradient_norm=norms)
         return (
             getattr(losses, name)(samples, target)
-            if name in ("reconstruction", "mask")
+            if name in ("reconstruction", "mask", "fog")
             else getattr(losses, name)(samples)
         )
 
@@ -191,6 +191,15 @@ def test_gradients_of_coupled_losses_in_double_precision():
     assert torch.autograd.gradcheck(
         coupled, (alpha_dot, double.density.requires_grad_(), double.residual.requires_grad_())
     )
+
+
+def test_the_gradient_of_geometry_with_the_surface_as_labels_in_double_precision():
+    double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
+
+    def follow(density):
+        return losses.geometry(replace(double, density=density), 50.0, 0.1, "surface_leads")
+
+    assert torch.autograd.gradcheck(follow, double.density.requires_grad_())
 
 
 def test_gradients_of_pose_and_deformation_losses_in_double_precision():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.boards import calibrate as calibration_boards
-from hnerf.calibration.boards.bundle import Poses
+from hnerf.calibration.boards.bundle import Adjustment, Poses
 from hnerf.calibration.boards.calibrate import board_evidence, calibrate_from_boards, visible_and_found
 from hnerf.calibration.boards.lens import estimate_lens
 from hnerf.calibration.boards.rig import (
@@ -61,6 +61,23 @@ def seen(cameras: list[Camera], lags: dict[str, float], frames: Sequence[int] = 
             R, t_m = board_at(frame + lags.get(camera.name, 0.0))
             corners_px[i, row] = camera.project(BOARD.corners_m @ R.T + t_m)[0]
     return corners_px + NOISE_PX * np.random.default_rng(0).normal(size=corners_px.shape)
+
+
+def test_each_residual_depends_only_on_the_unknowns_that_the_solver_is_told() -> None:
+    """The full Jacobian, by differences, is zero outside the pattern. Frame 2 is missing, and c does not see frame
+    0."""
+    cameras, frames = rig(), (0, 1, 3, 4)
+    corners_px = seen(cameras, {"b": LAG}, frames)
+    corners_px[2, 0] = np.nan
+    R, t_m = zip(*(board_at(frame) for frame in frames), strict=True)
+    boards = Poses(np.array(R), np.array(t_m))
+    adjustment = Adjustment(cameras, BOARD.corners_m, corners_px, boards, [False, True, True], 1, frames)
+    x = 0.01 * np.random.default_rng(0).normal(size=adjustment.size)
+    steps = 1e-4 * np.eye(adjustment.size)
+    jacobian = np.stack([adjustment.residuals(x + h) - adjustment.residuals(x - h) for h in steps], -1)
+    pattern = adjustment.sparsity().toarray()
+    assert pattern.shape == jacobian.shape and pattern.mean() < 0.5
+    assert not jacobian[~pattern].any() and jacobian[:, 6:].any(0).all()
 
 
 def test_pairs_are_compared_in_degrees_and_centimetres() -> None:
