@@ -3,6 +3,11 @@
 import errno
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+# Failures to read that say nothing about the file: a stale or unreachable share, a failing disk, a busy machine.
+UNREACHABLE = (
+    errno.EIO, errno.ESTALE, errno.EREMOTEIO, errno.ETIMEDOUT, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.EMFILE,
+    errno.ENFILE, errno.ENOMEM,
+)  # fmt: skip
 REASON = "hnerf: "  # begins the line on standard error that says why a process ends
 MAX_MESSAGE = 2000  # characters; text from a stranger's file may be longer
 
@@ -26,6 +31,12 @@ class PlaceError(InputError):
 
 class InvalidAsset(Exception):
     """A package that must not be delivered. The message names the file and every defect."""
+
+
+def raise_if_unreachable(error: Exception) -> None:
+    """Raise an error of reading a file that another attempt may not meet, so that it is not taken for bad input."""
+    if isinstance(error, OSError) and error.errno in UNREACHABLE:
+        raise error
 
 
 def printable(text: str) -> str:

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 from pydantic import BaseModel
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, raise_if_unreachable
 from tasks.store import sha256_of
 
 GROUND_TRUTH = "ground_truth"
@@ -16,8 +16,11 @@ MAX_FILE_BYTES = 1 << 38  # a sparse file takes no disk space, but hours to read
 
 
 def place(given: Path | str) -> Path | str:
-    """Return a path, or the URL of something in a bucket. file:// URLs become paths."""
+    """Return a path, or the URL of something in a bucket. file:// URLs become paths. Raises InputError for an empty
+    text, which as a path would be the current folder."""
     text = str(given).removeprefix("file://")
+    if not text:
+        raise InputError("the capture's folder is empty text; give its path or URL")
     return text if isinstance(given, str) and "://" in text else Path(text)
 
 
@@ -111,6 +114,7 @@ def _digest(folder: Path, files: Iterable[Path]) -> str:
 
 
 def _refuse(error: OSError, path: Path | None = None) -> NoReturn:
+    raise_if_unreachable(error)
     raise InputError(
         f"{path or error.filename}: cannot be read ({error.strerror}); make it readable or take it out of the folder"
     ) from None

@@ -20,7 +20,7 @@ from torch import Tensor
 from hnerf.body.rig import Rig
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.capture.safe_pickle import MAX_BYTES, read_pickle
-from hnerf.errors import InputError
+from hnerf.errors import InputError, raise_if_unreachable
 from hnerf.geometry.axes import Z_UP_FROM_Y_UP
 
 BETAS = 10
@@ -155,7 +155,8 @@ def _read(path: Path) -> dict[str, Any]:
     else:
         try:
             found = read_arrays(path, KEYS, MAX_BYTES)
-        except ARRAY_FILE_ERRORS:
+        except ARRAY_FILE_ERRORS as error:
+            raise_if_unreachable(error)
             raise InputError(f"{path}: is not a .npz of plain arrays; convert the model again") from None
     missing = [key for key in KEYS if key not in found]
     if missing:

@@ -20,7 +20,7 @@ from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.lens import checked_lens
 from hnerf.capture.safe_io import check_image_size
 from hnerf.capture.timing import median_step, nearest_frame, resample
-from hnerf.errors import InputError
+from hnerf.errors import InputError, raise_if_unreachable
 from hnerf.geometry.camera import Camera
 
 PERSON = "person"  # folder: <camera>/<frame>.png, 255 times the probability
@@ -107,7 +107,7 @@ class Capture:
 
     def _grey(self, folder: str, camera: str, frame: int, advice: str) -> np.ndarray | None:
         path = self._grey_path(folder, camera, frame)
-        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.exists() else None
+        grey = _decoded(path, cv2.IMREAD_GRAYSCALE)
         if grey is None and path.exists():
             raise InputError(f"{path}: not a readable image; {advice}")
         return grey
@@ -251,7 +251,7 @@ def checked_capture(capture: Capture) -> Capture:
 
 def read_rgb(path: Path) -> np.ndarray:
     """Read an image file as (H, W, 3) uint8 RGB. Raises InputError if it cannot be read."""
-    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    bgr = _decoded(path, cv2.IMREAD_COLOR)
     if bgr is None:
         raise InputError(f"{path}: not a readable image; export it again as JPEG or PNG")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
@@ -260,10 +260,20 @@ def read_rgb(path: Path) -> np.ndarray:
 def read_rgba(path: Path) -> np.ndarray:
     """Read an image file that `write_image` wrote as (H, W, 4) uint8. Raises InputError if it cannot be read or has no
     alpha."""
-    bgra = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    bgra = _decoded(path, cv2.IMREAD_UNCHANGED)
     if bgra is None or bgra.shape[2:] != (4,):
         raise InputError(f"{path}: no readable image with an alpha channel; make it again")
     return cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
+
+
+def _decoded(path: Path, mode: int) -> np.ndarray | None:
+    """Return the image in a file as OpenCV has it, channels last and blue first; None if there is none."""
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise_if_unreachable(error)
+        return None
+    return cv2.imdecode(content, mode) if len(content) else None
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:

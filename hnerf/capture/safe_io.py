@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, raise_if_unreachable
 
 MAX_IMAGE_PIXELS = 36_000_000  # a frame of 8K video has 33 million
 MAX_SIDE_PX = 32_766  # of images that OpenCV can undistort
@@ -82,6 +82,7 @@ def path_in_capture(root: Path, *parts: str) -> Path:
         except (FileNotFoundError, NotADirectoryError):
             continue
         except (OSError, ValueError) as error:  # a name that is too long or holds a NUL; a folder that may not be read
+            raise_if_unreachable(error)
             raise InputError(f"{path}: cannot be read ({error}); rename it or make it readable") from None
         if stat.S_ISLNK(mode):
             raise InputError(f"{path}: is a symbolic link; put the file itself into the capture folder")
@@ -161,6 +162,7 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
                 raise InputError(f"{path}: {status.st_size} bytes are too many for such a file; export it again")
             return file.read(max_bytes)
     except OSError as error:
+        raise_if_unreachable(error)
         raise InputError(f"{path}: cannot be read ({error.strerror}); add it to the capture folder") from None
     except ValueError:
         raise InputError(f"{path}: cannot be the name of a file; rename it") from None
@@ -274,6 +276,7 @@ def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.
     except FileNotFoundError:
         raise InputError(f"{path}: image missing; add it to the capture folder") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise_if_unreachable(error)
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise InputError(f"{path}: not a readable image ({reason}); export it again as JPEG or PNG") from None
 

@@ -14,7 +14,7 @@ from hnerf.capture.lens import Lens
 from hnerf.capture.masks import Masks
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, path_in_capture, read_arrays, read_image
-from hnerf.errors import InputError
+from hnerf.errors import InputError, raise_if_unreachable
 
 ON_BLACK = "ground_truth/on_black"
 MAX_MESHES_BYTES = 2_000_000_000  # unpacked; 60 frames of a million vertices have 1.4 GB
@@ -72,6 +72,7 @@ class GroundTruth:
                 raise ValueError(f"a face index is out of range, or a vertex is not within {MAX_M} m")
             return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
         except (*ARRAY_FILE_ERRORS, IndexError) as error:
+            raise_if_unreachable(error)
             raise InputError(
                 f"{path}: true surfaces cannot be read ({error}); write the file again or delete it"
             ) from None

@@ -20,7 +20,7 @@ from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.config import FitSettings
-from hnerf.errors import InputError
+from hnerf.errors import InputError, raise_if_unreachable
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 from hnerf.geometry.rotations import slerp
 from hnerf.progress import tracked
@@ -189,7 +189,8 @@ def _read_amass(path: Path) -> tuple[GivenPoses, float]:
     keys = ("poses", "trans", *AMASS_RATES)
     try:
         found = {key: array.astype(np.float64) for key, array in read_arrays(path, keys, MAX_MOTION_BYTES).items()}
-    except ARRAY_FILE_ERRORS:
+    except ARRAY_FILE_ERRORS as error:
+        raise_if_unreachable(error)
         raise InputError(f"{path}: not an .npz of plain arrays; give an AMASS file or a subject's folder") from None
     poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
     known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0

@@ -1,5 +1,7 @@
 """Untrusted images are read upright whatever their metadata say, and their size is limited."""
 
+import os
+import resource
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -9,9 +11,9 @@ import pytest
 from peak_memory import peak_mib, reset_peak
 from PIL import Image
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, read_rgb, read_rgba
 from hnerf.capture.ingest import ingest
-from hnerf.capture.safe_io import check_image_size, read_image, read_mask
+from hnerf.capture.safe_io import check_image_size, read_bytes, read_image, read_mask
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture import recordings as rec
@@ -115,3 +117,20 @@ def test_the_largest_image_takes_less_than_500_mb(tmp_path: Path) -> None:
     before_mib = peak_mib()
     read_image(tmp_path / "a.png")
     assert (peak_mib() - before_mib) << 20 < 500_000_000
+
+
+@pytest.mark.parametrize("read", [read_image, read_rgb, read_rgba, lambda path: read_bytes(path, 10_000)])
+def test_a_machine_without_room_for_open_files_is_not_bad_input(read: Callable[[Path], object], tmp_path: Path) -> None:
+    """The same file is read before; then there are no more file numbers."""
+    image = tmp_path / "0.png"
+    Image.new("RGBA", (4, 3)).save(image)
+    read(image)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    free = os.open(os.devnull, os.O_RDONLY)
+    os.close(free)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))
+    try:
+        with pytest.raises(OSError, match="Too many open files"):
+            read(image)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

@@ -1,3 +1,4 @@
+import errno
 import os
 from pathlib import Path
 from unittest.mock import Mock
@@ -165,6 +166,12 @@ def test_unreadable_files_and_folders_are_bad_input(folder: Path, monkeypatch: p
         read_capture(folder)
 
 
+def test_a_share_that_is_away_is_not_bad_input(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "sha256_of", Mock(side_effect=OSError(errno.ESTALE, "Stale file handle")))
+    with pytest.raises(OSError, match="Stale file handle"):
+        read_capture(folder)
+
+
 def test_a_store_in_the_capture_is_bad_input(folder: Path) -> None:
     """Its files would change the capture's digest, so that no artifact would be found again."""
     read_capture(folder, folder.parent / "store")
@@ -180,3 +187,5 @@ def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
 def test_a_local_place_is_a_path_and_a_remote_one_a_url() -> None:
     given = ("s3://b/ada", "file:///ada", "ada", Path("ada"))
     assert [place(one) for one in given] == ["s3://b/ada", Path("/ada"), Path("ada"), Path("ada")]
+    with pytest.raises(InputError, match="empty"):
+        place("")
