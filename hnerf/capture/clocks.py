@@ -18,6 +18,7 @@ from hnerf.capture.safe_io import path_in_capture, read_toml
 from hnerf.capture.timing import resample
 from hnerf.config import validated
 from hnerf.errors import InputError
+from hnerf.files import replace_text
 
 FILE = "clocks.toml"
 IRREGULAR = 0.5  # of a frame's duration: how far a video's frames may be off an even rate
@@ -100,7 +101,7 @@ def write_clocks(path: Path, clocks: Mapping[str, Clock]) -> None:
         f'["{name}"]\noffset_s = {clock.offset_s:.5f}\ndrift_ppm = {1e6 * (clock.rate - 1):.1f}\n'
         for name, clock in clocks.items()
     )
-    path.write_text("# a camera's own time: (1 + drift_ppm / 1e6) t + offset_s\n\n" + "\n".join(tables))
+    replace_text(path, "# a camera's own time: (1 + drift_ppm / 1e6) t + offset_s\n\n" + "\n".join(tables))
 
 
 def in_step(

@@ -1,7 +1,10 @@
 """Synchronised footage: clocks, frame rates, uneven rates, rotation."""
 
+import errno
+import os
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -124,6 +127,13 @@ def test_frames_at_an_uneven_rate_are_matched_by_time(tmp_path: Path) -> None:
     other = int(capture.image("a", capture.frames[-1])[20, 20].mean())
     last_s = 0.04 * round(other / 10)
     assert abs(last_s - times_s[round(level / 10)]) <= 0.041  # half of the longer frame; 0.2 s if matched by number
+
+
+def test_clocks_that_cannot_be_written_leave_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "replace", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+    with pytest.raises(OSError, match="No space left"):
+        write_clocks(tmp_path / "clocks.toml", {"a": Clock()})
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_frame_rate_is_that_of_the_camera_that_sets_the_instants(tmp_path: Path) -> None:
