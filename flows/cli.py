@@ -10,24 +10,25 @@ from contextlib import suppress
 from pathlib import Path
 
 from flows import commands
+from flows.arguments import MAX_COUNT, number, path
 from flows.display import display
-from flows.ending import Terminated, drop_what_is_left, open_closed_streams, unwound_by_sigterm
+from flows.ending import Terminated, drop_what_is_left, open_closed_streams, unwound_by_signals
 from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
-from hnerf.errors import DISK_FULL, REASON, InputError, InvalidAsset
+from hnerf.errors import DISK_FULL, REASON, UNREACHABLE, InputError, InvalidAsset
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
 from tasks.source import place
 from tasks.store import NAME, Store
 
-FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143  # the last two as in shells
+FAILED, BAD_INPUT, INTERRUPTED, ENDED = 1, 2, 130, 128  # as in shells: 128 plus the signal's number
 NO_ROOM = (None, *DISK_FULL, errno.EFBIG)  # None: our own errors, for libraries that do not say why
 CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # as in hnerf.capture.formats.export
 PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # as in hnerf.render.subject, which imports torch
 SIZES_PX = (2, 8000)  # of an image's side, as in the same module
 ORBIT_PICTURES = 60  # as in the same module
 STATURE_M = (0.5, 2.3)  # as in hnerf.calibration.diagnosis, which imports numpy
-MAX_COUNT, MAX_M = 999_999, 1000  # image names have six digits
+MAX_M = 1000
 FOLDERS = {
     "capture": "the capture folder, or one video",
     "folder": "the capture folder",
@@ -43,7 +44,7 @@ log = logging.getLogger("hnerf")
 def main(argv: list[str] | None = None) -> int:
     """Run one command; return its exit code. Errors are one line on stderr. The code is 2 for input and paths that
     cannot be used; 1 for a training that cannot continue, an asset that must not be delivered, or output that nobody
-    reads; 130 if interrupted from the keyboard; 143 after SIGTERM."""
+    reads; 130 if interrupted from the keyboard; 143 after SIGTERM, 129 after SIGHUP."""
     open_closed_streams()
     try:
         return _run(argv)
@@ -55,20 +56,24 @@ def _run(argv: list[str] | None) -> int:
     """Run one command; return the exit code."""
     try:
         options = _options(argv)
-        with unwound_by_sigterm(), display():
+        with unwound_by_signals(), display():
             folders = _existing(options)
             if options.command.__module__ == commands.__name__ and options.command is not commands.settings:
                 log.info("%s", " ".join([_name(options.command), *map(str, folders)]))
             options.command(options)
         sys.stdout.flush()
-    except Terminated:
-        return _fail("ended by SIGTERM", TERMINATED)
+    except Terminated as error:
+        return _fail(f"ended by {error.signal.name}", ENDED + error.signal)
     except KeyboardInterrupt:
         return _fail("interrupted", INTERRUPTED)
     except InputError as error:
         return _fail(error, BAD_INPUT)
     except (RankFailedError, LostWorkerError, StalledError, InvalidAsset) as error:
         return _fail(error, FAILED)
+    except RuntimeError as error:
+        if not isinstance(error.__context__, OSError) or error.__context__.errno != errno.ELOOP:
+            raise
+        return _fail(f"{error}; give another path, or mend this one", BAD_INPUT)  # Path.resolve
     except OSError as error:
         if isinstance(error, BrokenPipeError) and _reader_has_left():
             return FAILED
@@ -78,6 +83,8 @@ def _run(argv: list[str] | None) -> int:
             return _fail(error, FAILED)
         if error.errno in NO_ROOM:
             return _fail(f"{error}; make room and give the same command again", FAILED)
+        if error.errno in UNREACHABLE:
+            return _fail(f"{error}; give the same command again", FAILED)
         from tasks.policy import is_permanent  # imports Prefect
 
         if error.filename is None or not is_permanent(error):
@@ -161,9 +168,9 @@ def _parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
 
     store, preset = (argparse.ArgumentParser(add_help=False) for _ in range(2))
-    store.add_argument("--store", type=Path, default=Path("store"), help="folder of results (default: store)")
+    store.add_argument("--store", type=path, default=Path("store"), help="folder of results (default: store)")
     capture = argparse.ArgumentParser(add_help=False, parents=[store])
-    capture.add_argument("capture", type=Path, help="capture folder, or one video")
+    capture.add_argument("capture", type=path, help="capture folder, or one video")
     preset.add_argument("--preset", default="fast", help="preset of configs/, or a YAML file (default: fast)")
 
     def add(command: Command, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -183,10 +190,12 @@ def _parser() -> argparse.ArgumentParser:
     _add_overrides(caged, "override a setting under `limits.`")
     _add_calibrate(add(commands.calibrate, caged))
     synchronise = add(commands.synchronise, caged)
-    synchronise.add_argument("folder", type=Path, help="capture whose cameras did not start together")
+    synchronise.add_argument("folder", type=path, help="capture whose cameras did not start together")
     cameras = add(commands.export_cameras, caged)
     cameras.add_argument(
-        "folder", type=Path, help="capture folder, what `hnerf calibrate` wrote, or <store>/subjects/<name>/calibration"
+        "folder",
+        type=path,
+        help="capture folder, what `hnerf calibrate` wrote, or <store>/subjects/<name>/calibration",
     )
     cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True, help="format to write")
     _add_out(cameras, "cameras")
@@ -199,7 +208,7 @@ def _parser() -> argparse.ArgumentParser:
     what = "List, check, clean up and transfer what the store holds."
     add_store_commands(subparsers.add_parser("store", help=what, description=what))
     synth = add(commands.synth)
-    synth.add_argument("out", type=Path, help="new folder to write")
+    synth.add_argument("out", type=path, help="new folder to write")
     _add_overrides(synth, "override a setting, like train_cameras=32; `hnerf settings` lists all at its end")
     add(commands.models)
     add(commands.demo)
@@ -211,7 +220,7 @@ def _add_overrides(command: argparse.ArgumentParser, what: str) -> None:
 
 
 def _add_calibrate(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, help="capture folder, or a folder with calibration/extrinsic/")
+    command.add_argument("folder", type=path, help="capture folder, or a folder with calibration/extrinsic/")
     command.add_argument(
         "--from", dest="source", choices=("boards", "person"), default="boards",
         help="calibrate from footage of a board (default), or from the person in the capture",
@@ -222,19 +231,19 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
     )
     boards = command.add_argument_group("from boards")
     what = "frame in which the board lies on the floor: the world's origin"
-    boards.add_argument("--ground-frame", type=_number(int, 0, MAX_COUNT), metavar="N", help=what)
+    boards.add_argument("--ground-frame", type=number(int, 0, MAX_COUNT), metavar="N", help=what)
     person = command.add_argument_group("from the person")
     what = "the person's height (default: stature_m of capture.toml, else 1.65)"
-    person.add_argument("--height", type=_number(float, *STATURE_M), metavar="M", help=what)
-    person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML file")
+    person.add_argument("--height", type=number(float, *STATURE_M), metavar="M", help=what)
+    person.add_argument("--lens", type=path, metavar="FILE", help="intrinsics: intri.yml, or a TOML file")
     what = "field of view across the longer side (default: metadata, else estimated)"
-    person.add_argument("--fov", type=_number(float, 1, 170), metavar="DEG", help=what)
+    person.add_argument("--fov", type=number(float, 1, 170), metavar="DEG", help=what)
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
-    export.add_argument("subject", type=Path, help="<store>/subjects/<name> of a finished `hnerf run`")
+    export.add_argument("subject", type=path, help="<store>/subjects/<name> of a finished `hnerf run`")
     export.add_argument(
-        "--motion", type=Path, action="append", default=[], metavar="FILE",
+        "--motion", type=path, action="append", default=[], metavar="FILE",
         help=f"add this motion: {MOTIONS}",
     )  # fmt: skip
     export.add_argument(
@@ -245,7 +254,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 
 
 def _add_out(command: argparse.ArgumentParser, default: str) -> None:
-    command.add_argument("--out", type=Path, default=Path(default), help=f"new folder to write (default: {default})")
+    command.add_argument("--out", type=path, default=Path(default), help=f"new folder to write (default: {default})")
 
 
 def _add_study(command: argparse.ArgumentParser, default: str, folder: str) -> None:
@@ -262,7 +271,7 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     what = "presets or YAML files to compare, like fast,nerf (default: the study's)"
     benchmark.add_argument("--methods", type=_names, metavar="LIST", help=what)
     what = "time limit of each training (default: the study's)"
-    benchmark.add_argument("--seconds", type=_number(float, 0.1, 1_000_000), metavar="S", help=what)
+    benchmark.add_argument("--seconds", type=number(float, 0.1, 1_000_000), metavar="S", help=what)
 
 
 def _add_ablate(ablations: argparse.ArgumentParser) -> None:
@@ -287,20 +296,8 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _number(kind: type[float], low: float, high: float) -> Callable[[str], float]:
-    """Return an option type that takes numbers in a range, int or float, and refuses others, including NaN."""
-
-    def read(text: str) -> float:
-        with suppress(ValueError):
-            if low <= (value := kind(text)) <= high:
-                return value
-        raise argparse.ArgumentTypeError(f"give {'a whole number' if kind is int else 'a number'} from {low} to {high}")
-
-    return read
-
-
 def _add_render(render: argparse.ArgumentParser) -> None:
-    render.add_argument("subject", type=Path, help="<store>/subjects/<name> of a finished `hnerf run`")
+    render.add_argument("subject", type=path, help="<store>/subjects/<name> of a finished `hnerf run`")
     _add_out(render, "pictures")
     render.add_argument(
         "--what", type=_names, default="colour", metavar="LIST",
@@ -308,27 +305,27 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     view = render.add_mutually_exclusive_group()
     view.add_argument("--camera", help="look through this recorded camera (default: an orbit)")
-    view.add_argument("--path", type=Path, help="fly along these cameras: a JSON list, or a folder")
+    view.add_argument("--path", type=path, help="fly along these cameras: a JSON list, or a folder")
     what = "radius of the orbit (default: that of the recorded cameras)"
-    render.add_argument("--radius", type=_number(float, 0.1, MAX_M), metavar="M", help=what)
+    render.add_argument("--radius", type=number(float, 0.1, MAX_M), metavar="M", help=what)
     what = "height above the person's middle (default: that of the recorded cameras)"
-    render.add_argument("--height", type=_number(float, -MAX_M, MAX_M), metavar="M", help=what)
+    render.add_argument("--height", type=number(float, -MAX_M, MAX_M), metavar="M", help=what)
     render.add_argument(
-        "--motion", type=Path, metavar="FILE", help=f"show this motion: {MOTIONS} (default: the captured one)"
+        "--motion", type=path, metavar="FILE", help=f"show this motion: {MOTIONS} (default: the captured one)"
     )
     render.add_argument(
         "--frames", default=":", metavar="FIRST:END:STEP", help="frames to show, or one number (default: all)"
     )
     what = "interpolate between the poses of two frames"
-    render.add_argument("--between", nargs=2, type=_number(int, 0, MAX_COUNT), metavar="FRAME", help=what)
+    render.add_argument("--between", nargs=2, type=number(int, 0, MAX_COUNT), metavar="FRAME", help=what)
     what = "add X to a shape value of the body; may be repeated"
     render.add_argument("--shape", action="append", default=[], metavar="NAME=+X", help=what)
     what = "change the body's volume by this, like -40 or 80"
-    render.add_argument("--volume", type=_number(float, -100, 1000), metavar="PERCENT", help=what)
+    render.add_argument("--volume", type=number(float, -100, 1000), metavar="PERCENT", help=what)
     what = "longest side of an image (default: that of the capture)"
-    render.add_argument("--size", type=_number(int, *SIZES_PX), metavar="PX", help=what)
+    render.add_argument("--size", type=number(int, *SIZES_PX), metavar="PX", help=what)
     what = f"number of images (default: one per pose; {ORBIT_PICTURES} for --between, and for one pose on an orbit)"
-    render.add_argument("--pictures", type=_number(int, 1, MAX_COUNT), metavar="N", help=what)
+    render.add_argument("--pictures", type=number(int, 1, MAX_COUNT), metavar="N", help=what)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How a command ends on a signal, and how it handles streams that were closed before it started or cannot be
+"""How a command ends on SIGTERM or SIGHUP, and how it handles streams that were closed before it started or cannot be
 written."""
 
 import fcntl
@@ -10,30 +10,39 @@ from contextlib import contextmanager
 from threading import Timer
 from types import FrameType
 
+ENDING = (signal.SIGTERM, signal.SIGHUP)
 SEND_AGAIN_S = 0.1  # by then, Python has left the code that drops exceptions
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM as an exception, which unwinds a command as Ctrl-C does."""
+    """A signal as an exception, which unwinds a command as Ctrl-C does."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.signal = signal.Signals(number)
 
 
 @contextmanager
-def unwound_by_sigterm() -> Iterator[None]:
-    """Raise Terminated in the code inside on the first SIGTERM. Ignore further ones, which timeout(1) sends while files
-    are being removed. Processes that a command starts have the default handler again. If Python drops this exception or
-    that of Ctrl-C, as in a weak reference's callback, the signal is sent once more."""
-    before, hook = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
+def unwound_by_signals() -> Iterator[None]:
+    """Raise Terminated in the code inside on the first SIGTERM or SIGHUP (a closed terminal). Ignore further ones,
+    which timeout(1) sends while files are being removed, and signals that were ignored before, as under nohup(1).
+    Processes that a command starts have the default handler again. If Python drops this exception or that of Ctrl-C, as
+    in a weak reference's callback, the signal is sent once more."""
+    heeded = [number for number in ENDING if signal.getsignal(number) is not signal.SIG_IGN]
+    before, hook = {number: signal.signal(number, _terminate) for number in heeded}, sys.unraisablehook
     sys.unraisablehook = lambda dropped: _send_again(dropped.exc_value) or hook(dropped)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         sys.unraisablehook = hook
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_IGN)
-    raise Terminated
+    for one in ENDING:
+        signal.signal(one, signal.SIG_IGN)
+    raise Terminated(number)
 
 
 def _send_again(dropped: BaseException | None) -> bool:
@@ -43,7 +52,7 @@ def _send_again(dropped: BaseException | None) -> bool:
         return False
     number = signal.SIGINT
     if isinstance(dropped, Terminated):
-        number = signal.SIGTERM
+        number = dropped.signal
         signal.signal(number, _terminate)
     timer = Timer(SEND_AGAIN_S, os.kill, (os.getpid(), number))
     timer.daemon = True  # a process that has ended by then needs no signal

@@ -8,6 +8,7 @@ from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flows.arguments import MAX_COUNT, number, path
 from hnerf.errors import InputError, printable
 
 if TYPE_CHECKING:  # importing Prefect takes seconds; help must not wait for that
@@ -130,7 +131,7 @@ def add_store_commands(store: argparse.ArgumentParser) -> None:
     )
     added["gc"].add_argument(
         "--keep",
-        type=_at_least_one,
+        type=number(int, 1, MAX_COUNT),
         default=1,
         metavar="N",
         help="keep the results of the N newest runs of each subject that made an asset (default: 1)",
@@ -142,10 +143,10 @@ def add_store_commands(store: argparse.ArgumentParser) -> None:
         metavar="TIME",
         help="only what has not been used for so long: 30d, 12h, 0 (default: 1d)",
     )
-    added["export"].add_argument("--out", type=Path, help="new file to write (default: NAME.tar)")
-    added["import"].add_argument("archive", type=Path, help="archive of `hnerf store export`")
+    added["export"].add_argument("--out", type=path, help="new file to write (default: NAME.tar)")
+    added["import"].add_argument("archive", type=path, help="archive of `hnerf store export`")
     for parser in added.values():
-        parser.add_argument("--store", type=Path, default=Path("store"), help="folder of results (default: store)")
+        parser.add_argument("--store", type=path, default=Path("store"), help="folder of results (default: store)")
 
 
 def duration_s(text: str) -> float:
@@ -154,12 +155,6 @@ def duration_s(text: str) -> float:
     if not matched or not (matched[2] or matched[1] == "0"):
         raise ArgumentTypeError("give a time like 30d, 12h or 0")
     return float(int(matched[1]) * UNITS_S.get(matched[2], 0))
-
-
-def _at_least_one(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or int(text) < 1:
-        raise ArgumentTypeError("give 1 or more")
-    return int(text)
 
 
 def _store(options: argparse.Namespace) -> "Store":

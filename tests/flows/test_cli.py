@@ -124,10 +124,34 @@ def test_the_error_of_a_store_that_cannot_be_created_is_one_line_with_exit_code_
         assert line.startswith(f"hnerf: {store}") and why in line
 
 
-def test_a_transient_error_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_error_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for error in (OSError(errno.EBADF, "Bad file descriptor", "a.jpg"), RuntimeError("a shape is wrong")):
+        monkeypatch.setattr(train_subject, "fn", Mock(side_effect=error))
+        with pytest.raises(type(error), match=str(error.args[-1])):
+            main(["run", str(tmp_path)])
+
+
+def test_the_error_of_a_failing_disk_is_one_line_with_exit_code_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(train_subject, "fn", Mock(side_effect=OSError(errno.EIO, "Input/output error", "a.jpg")))
-    with pytest.raises(OSError, match="Input/output error"):
-        main(["run", str(tmp_path)])
+    assert main(["run", str(tmp_path)]) == 1
+    told = "hnerf: [Errno 5] Input/output error: 'a.jpg'; give the same command again\n"
+    assert capsys.readouterr().err == told
+
+
+def test_a_loop_of_links_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    assert main(["store", "list", "--store", str(tmp_path / "loop")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "loop" in line and line.endswith("give another path, or mend this one")
+
+
+def test_an_empty_path_is_not_taken_for_the_current_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["store", "list", "--store", ""])
+    assert capsys.readouterr().err.endswith("error: argument --store: is empty; give a path\n")
+    assert main(["run", ""]) == 2
 
 
 def test_the_error_of_a_full_disk_is_one_line_with_exit_code_1(
@@ -308,7 +332,7 @@ def test_a_closed_output_pipe_ends_a_command_quietly() -> None:
         ("benchmark . --seconds -3", "--seconds: give a number from 0.1 to 1000000"),
         ("benchmark . --methods ,", "--methods: give one name or more"),
         ("render . --what ,", "--what: give one name or more"),
-        ("store gc --keep 0", "--keep: give 1 or more"),
+        ("store gc --keep 0", "--keep: give a whole number from 1 to 999999"),
     ],
 )
 def test_the_error_of_an_invalid_option_value_states_the_valid_range(

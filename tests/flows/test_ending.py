@@ -1,4 +1,4 @@
-"""Commands that receive SIGTERM, and commands whose streams are closed or full."""
+"""Commands that receive SIGTERM or SIGHUP, and commands whose streams are closed or full."""
 
 import os
 import signal
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from flows.cli import main
-from flows.ending import Terminated, unwound_by_sigterm
+from flows.ending import Terminated, unwound_by_signals
 from hnerf import synthetic
 
 RUN = "import sys; from flows.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -23,20 +23,29 @@ from flows.cli import main
 def write(out, settings):
     import hnerf.pycolmap_import
     (out / "half").touch()
-    os.kill(os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), int(sys.argv.pop()))
     time.sleep(60)
 
 sys.modules["hnerf.synthetic"] = SimpleNamespace(write_synthetic_capture=write)  # without what it imports
-sys.exit(main(sys.argv[1:]))
+sys.exit(main(sys.argv[1:-1]))
 """
 
 
-def test_sigterm_prints_one_line_and_leaves_no_partial_files(tmp_path: Path) -> None:
-    """Also with pycolmap loaded, which would report the signal as a crash."""
-    command = [sys.executable, "-c", ENDED_MIDWAY, "synth", str(tmp_path / "ada")]
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_signals_print_one_line_and_leave_no_partial_files(tmp_path: Path, number: signal.Signals, status: int) -> None:
+    """Also with pycolmap loaded, which would report SIGTERM as a crash."""
+    command = [sys.executable, "-c", ENDED_MIDWAY, "synth", str(tmp_path / "ada"), str(int(number))]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (143, "hnerf: ended by SIGTERM\n")
+    assert (ended.returncode, ended.stderr) == (status, f"hnerf: ended by {number.name}\n")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_hangup_that_is_ignored_stays_ignored() -> None:
+    """As for a command under nohup(1)."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with unwound_by_signals():
+        signal.raise_signal(signal.SIGHUP)
+    assert signal.signal(signal.SIGHUP, before) is signal.SIG_IGN
 
 
 @pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
@@ -49,7 +58,7 @@ def test_a_signal_during_a_weak_reference_callback_is_not_lost(
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore SIGINT
     referred = Referred()
     reference = weakref.ref(referred, lambda _: signal.raise_signal(number))
-    with pytest.raises(raised) as found, unwound_by_sigterm():
+    with pytest.raises(raised) as found, unwound_by_signals():
         del referred
         time.sleep(10)
     signal.signal(signal.SIGINT, before)
@@ -58,7 +67,7 @@ def test_a_signal_during_a_weak_reference_callback_is_not_lost(
 
 def test_a_second_sigterm_does_not_interrupt_the_clean_up(tmp_path: Path) -> None:
     cleaned = []
-    with pytest.raises(Terminated), unwound_by_sigterm():
+    with pytest.raises(Terminated), unwound_by_signals():
         try:
             signal.raise_signal(signal.SIGTERM)
         finally:

@@ -1,0 +1,27 @@
+"""Types of command-line arguments."""
+
+import argparse
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+MAX_COUNT = 999_999  # image names have six digits
+
+
+def path(text: str) -> Path:
+    """Return a path. An empty one, as from a variable that is not set, would be the current folder."""
+    if not text:
+        raise argparse.ArgumentTypeError("is empty; give a path")
+    return Path(text)
+
+
+def number(kind: type[float], low: float, high: float) -> Callable[[str], float]:
+    """Return an option type that takes numbers in a range, int or float, and refuses others, including NaN."""
+
+    def read(text: str) -> float:
+        with suppress(ValueError):
+            if low <= (value := kind(text)) <= high:
+                return value
+        raise argparse.ArgumentTypeError(f"give {'a whole number' if kind is int else 'a number'} from {low} to {high}")
+
+    return read
