@@ -123,6 +123,8 @@ def _left_behind(inventory: Inventory) -> Iterator[Garbage]:
         if matched[2] not in ("", ".json") or record in lost or not record.exists():
             left.setdefault((path.parent.name, matched[1]), []).append(path)
     for (stage, key), paths in left.items():
+        if f"{stage}/{key}" in used:  # the stage failed and waits for its next try
+            continue
         recorded = inventory.store.path(stage, key, ".json").exists()
         if not (recorded and all(path.suffix == ".lock" for path in paths)):
             files = [file for path in paths for file in [path, *path.rglob("*")]]

@@ -56,7 +56,7 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
     ends: the kernel signals the caller's death to torchrun, and torchrun's death to the ranks.
     """
     _remove_left_behind()
-    with TemporaryDirectory(prefix=LOGS) as logs, Path(logs, LOCK).open("w") as lock:
+    with TemporaryDirectory(prefix=LOGS, dir=_temporary_folder()) as logs, Path(logs, LOCK).open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel releases it, however this process ends
         command = [sys.executable, "-m", "tasks.agent", f"{logs}/{FAILURE}"]
         command += ["--standalone", f"--nproc-per-node={processes}", "--tee=3", f"--log-dir={logs}"]
@@ -80,10 +80,19 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
             raise _error(module, Path(logs), agent.returncode)
 
 
+def _temporary_folder() -> str:
+    """Return the folder of temporary files. Raises OSError for a full disk if none takes a file, which Python reports
+    as a missing folder."""
+    try:
+        return gettempdir()
+    except FileNotFoundError:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/tmp") from None
+
+
 def _remove_left_behind() -> None:
     """Remove log folders whose process was killed. A folder is in use while its lock is held; a recent one may not be
     locked yet."""
-    for folder in Path(gettempdir()).glob(f"{LOGS}*"):
+    for folder in Path(_temporary_folder()).glob(f"{LOGS}*"):
         with suppress(OSError), (folder / LOCK).open("r+") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if time.time() - (folder / LOCK).stat().st_mtime > YOUNG_S:

@@ -26,7 +26,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -171,6 +171,9 @@ class Store:
                     error.filename = str(self.root)
                 if not resumable or (isinstance(error, InputError) and not isinstance(error, PlaceError)):
                     remove(partial)
+                else:
+                    with suppress(OSError):  # an error here would hide the one that ended the work
+                        pin(self.root, f"{stage}/{key}")  # not garbage while this process may try again
                 raise
             finite = {name: value for name, value in metrics.items() if math.isfinite(value)}  # JSON has no others
             made = Artifact(stage=stage, root=self.path(stage, key), files={}, metrics=finite,

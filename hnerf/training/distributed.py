@@ -2,9 +2,12 @@
 
 import os
 from dataclasses import dataclass
+from datetime import timedelta
 
 import torch
 import torch.distributed as dist
+
+PATIENCE = timedelta(hours=12)  # of processes that wait while one gathers pixels; the stage's own limit ends a hang
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Distributed:
         if cuda:
             torch.cuda.set_device(device)
         if world_size > 1 and not dist.is_initialized():
-            dist.init_process_group("nccl" if cuda else "gloo")
+            dist.init_process_group("nccl" if cuda else "gloo", timeout=PATIENCE)
         return Distributed(rank, world_size, device)
 
     def all_max(self, value: float) -> float:

@@ -140,6 +140,17 @@ def test_unfinished_work_is_removed_unless_it_is_locked(store: Store) -> None:
     assert (store.root / "subjects" / "ada").is_dir()
 
 
+def test_work_whose_next_try_is_still_to_come_stays(tmp_path: Path) -> None:
+    def fail(out: Path) -> dict[str, float]:
+        (out / "checkpoint").touch()
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    store = Store(tmp_path)
+    with pytest.raises(OSError, match="Stale"):
+        store.get_or_compute("training", "a" * 32, fail, resumable=True)
+    assert garbage(store) == set()
+
+
 def test_unreadable_artifacts_are_removed_unless_a_subject_links_to_them(store: Store) -> None:
     """A damaged record, and a record whose folder was deleted. Otherwise both would stay forever, the first with its
     files."""

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
+from unittest.mock import Mock
 
 import pytest
 
@@ -175,3 +176,10 @@ def test_folders_of_killed_launchers_are_removed(tmp_path: Path, monkeypatch: py
         fcntl.flock(lock, fcntl.LOCK_EX)
         launcher._remove_left_behind()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hnerf-ranks-used", "hnerf-ranks-young"]
+
+
+def test_a_full_folder_of_temporary_files_is_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python reports it as a missing folder."""
+    monkeypatch.setattr(launcher, "gettempdir", Mock(side_effect=FileNotFoundError(2, "No usable temporary directory")))
+    with pytest.raises(OSError, match="No space left on device: '/tmp'"):
+        run_ranks(RANKS, [], 1)
