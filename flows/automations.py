@@ -29,6 +29,7 @@ BLOCK = "hnerf-operator"
 STARTING = ("Pending", "Submitting", "InfrastructurePending", "pull-step.executed")
 SIGNS_OF_LIFE = {f"prefect.flow-run.{sign}" for sign in ("heartbeat", *STARTING)}
 RUNS = {"prefect.resource.id": "prefect.flow-run.*"}
+SCANS = {"prefect.resource.role": "flow", "prefect.resource.name": "ingest-captures"}  # trainings wait as a rule
 
 
 def lost_runs(silence_s: int) -> AutomationCore:
@@ -56,7 +57,7 @@ def notices(block: UUID, pool: str) -> Iterator[AutomationCore]:
     ended = {f"prefect.flow-run.{state}" for state in ("Failed", "Crashed", "TimedOut")}
     yield _notice("failed runs", "A run failed, crashed or took too long.", RUNS, ended, run, block)
     late = "flow.name ~ ' ' ~ flow_run.name ~ ' is late: no worker takes it'"
-    yield _notice("late runs", "A run waits for a worker.", RUNS, {"prefect.flow-run.Late"}, late, block)
+    yield _notice("late runs", "A scan waits for a worker.", RUNS, {"prefect.flow-run.Late"}, late, block, SCANS)
     yield _notice(
         "no worker",
         "The work pool has no worker any more.",
@@ -75,8 +76,22 @@ def notices(block: UUID, pool: str) -> Iterator[AutomationCore]:
     )
 
 
-def _notice(name: str, what: str, match: dict[str, Any], expect: set[str], text: str, block: UUID) -> AutomationCore:
-    trigger = EventTrigger(match=match, for_each={"prefect.resource.id"}, expect=expect, posture=Posture.Reactive)  # type: ignore[arg-type]
+def _notice(
+    name: str,
+    what: str,
+    match: dict[str, Any],
+    expect: set[str],
+    text: str,
+    block: UUID,
+    related: dict[str, Any] | None = None,
+) -> AutomationCore:
+    trigger = EventTrigger(
+        match=match,  # type: ignore[arg-type]
+        match_related=related or {},  # type: ignore[arg-type]
+        for_each={"prefect.resource.id"},
+        expect=expect,
+        posture=Posture.Reactive,
+    )
     payload = '{"text": {{ (' + text + ") | tojson }}}"
     call = CallWebhook(block_document_id=block, payload=payload)
     return AutomationCore(name=f"hnerf: {name}", description=what, trigger=trigger, actions=[call])
@@ -108,6 +123,8 @@ def main(argv: list[str] | None = None) -> None:
         "--silence", type=int, default=SILENCE_S, metavar="S", help=f"after which a run is lost (default: {SILENCE_S})"
     )
     options = parser.parse_args(argv)
+    if options.webhook == "":
+        parser.exit(2, "--webhook is empty; give a URL, or leave the option out\n")
     if options.silence < MIN_SILENCE_S:
         parser.exit(2, f"--silence {options.silence}: healthy runs would be ended; give {MIN_SILENCE_S} or more\n")
     if not PREFECT_API_URL.value():  # Prefect would start its own server, which ends with this command

@@ -14,7 +14,7 @@ def units(root: Path) -> dict[str, str]:
     they have finished is in the store."""
     folder, prefect = _escaped(root), _escaped(root / ".venv" / "bin" / "prefect")
     server = f'"{prefect}" server start'
-    worker = f'"{prefect}" worker start --pool local --type process --limit 2'
+    worker = f'"{prefect}" worker start --pool local --type process --limit 5'
     return {
         "hnerf-server.service": _unit("H-NeRF: Prefect server", "network.target", folder, server),
         "hnerf-worker.service": _unit("H-NeRF: worker", "hnerf-server.service", folder, worker),

@@ -14,7 +14,7 @@ from flows.run_page import embedded, publish_link, publish_markdown, shown_progr
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
-from hnerf.errors import InputError, InvalidAsset, one_line
+from hnerf.errors import InputError, one_line
 from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
 from tasks.bucket import BucketError
@@ -22,18 +22,17 @@ from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
-from tasks.launcher import RankFailedError
 from tasks.ledger import forget
-from tasks.limits import StalledError, set_limits
+from tasks.limits import set_limits
 from tasks.quarantine import clear, note_run
+from tasks.quiet import EXPECTED
 from tasks.remote import NothingThereError, fetched, remote_capture
 from tasks.source import place, read_capture
+from tasks.stage import retried
 from tasks.store import OPTIONAL, Artifact, Store
 from tasks.training import train
 
 log = logging.getLogger("hnerf.train")
-
-NOTED = (InputError, InvalidAsset, BucketError, RankFailedError, StalledError)  # their messages suffice
 
 
 class Trained(NamedTuple):
@@ -70,7 +69,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
     capture = place(capture)
-    source, truth = read_capture(local_folder(artifact_store, capture), store)
+    source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
     recorded = ingest(artifact_store, source, settings.capture)
     normalised = Capture.load(recorded.root)
     held_out_cameras(normalised.train_cameras, normalised.test_cameras, settings.evaluation.holdout)
@@ -122,7 +121,7 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
     error = state.result(raise_on_failure=False)
     if isinstance(error, Exception):
         kind = "refused" if isinstance(error, InputError) else "failed"
-        why = str(error) if isinstance(error, NOTED) else f"{type(error).__name__}: {one_line(error)}"
+        why = str(error) if isinstance(error, EXPECTED) else f"{type(error).__name__}: {one_line(error)}"
         note_run(capture, store, f"{kind}: {why} (flow run {flow_run.name}, {flow_run.id})")
 
 
@@ -143,7 +142,7 @@ def local_folder(store: Store, capture: Path | str) -> Path:
             forget(store.root, capture)
         return capture
     try:
-        found = remote_capture(capture)
+        found = retried(remote_capture)(capture)
     except (NothingThereError, BucketError):
         forget(store.root, capture)
         raise

@@ -6,9 +6,10 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Concatenate, Generic, ParamSpec
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from prefect import Task
+from prefect.cache_policies import NO_CACHE
 from prefect.context import FlowRunContext
 from prefect.tasks import exponential_backoff
 
@@ -24,8 +25,15 @@ log = logging.getLogger("hnerf.stage")
 quieten()
 
 P = ParamSpec("P")
+T = TypeVar("T")
 CAPTURE = "capture.json"  # of a recording, hnerf/capture/capture.py
 NETWORKS = "networks"  # in a stage's key, in addition to its own inputs
+RETRIES: dict[str, Any] = {
+    "retries": 3,
+    "retry_delay_seconds": exponential_backoff(backoff_factor=10),
+    "retry_jitter_factor": 0.5,
+    "retry_condition_fn": is_transient,
+}
 Write = Callable[Concatenate[Path, P], dict[str, float]]
 
 
@@ -59,10 +67,7 @@ class Stage(Generic[P]):
             persist_result=True,
             result_serializer="json",
             cache_result_in_memory=False,
-            retries=3,
-            retry_delay_seconds=exponential_backoff(backoff_factor=10),
-            retry_jitter_factor=0.5,
-            retry_condition_fn=is_transient,
+            **RETRIES,
         )
 
     def __call__(self, store: Store, *args: P.args, **kwargs: P.kwargs) -> Artifact:
@@ -92,6 +97,13 @@ class Stage(Generic[P]):
     def _write_in_time(self, out: Path, inputs: dict[str, Input]) -> dict[str, float]:
         with limited(self.name, image_count(inputs.values()), self.resumable):
             return self.write(out, **inputs)  # type: ignore[call-arg, arg-type]
+
+
+def retried(function: Callable[P, T]) -> Callable[P, T]:
+    """Return a function that, within a flow run, is a task that is retried like a stage, and is never cached."""
+    if not FlowRunContext.get():
+        return function
+    return Task(fn=function, cache_policy=NO_CACHE, persist_result=False, **RETRIES)
 
 
 def image_count(inputs: Iterable[Input]) -> int:

@@ -46,6 +46,7 @@ def test_setting_up_twice_makes_each_automation_once_and_calls_the_webhook(
     with get_client(sync_client=True) as client:
         known = {one.name: one for one in client.read_automations()}
         assert len(known) == len(names) == 5 and known.keys() == set(names)
+        assert known["hnerf: late runs"].trigger.match_related.root["prefect.resource.name"] == "ingest-captures"
         deadline = time.monotonic() + PATIENCE_S
         while not heard and time.monotonic() < deadline:  # the server rereads automations only from time to time
             resource = {"prefect.resource.id": "hnerf.store./store", "prefect.resource.name": 'the "store"'}
@@ -104,6 +105,12 @@ def test_a_silence_shorter_than_that_of_healthy_runs_is_refused(capsys: pytest.C
     with pytest.raises(SystemExit, match="2"):
         main(["--silence", "30"])
     assert "give 60 or more" in capsys.readouterr().err
+
+
+def test_an_empty_webhook_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["--webhook", ""])
+    assert "--webhook is empty" in capsys.readouterr().err
 
 
 def test_no_automations_are_set_up_in_a_temporary_server(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,6 +18,7 @@ from prefect.states import Crashed
 
 from flows import restart
 from flows.restart import RELEASE, restart_crashed, unfinished_runs
+from flows.systemd_units import units
 
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE_S = 60.0
@@ -41,6 +42,14 @@ def runs_of(flow: str) -> list[FlowRun]:
             flow_filter=FlowFilter(name=FlowFilterName(any_=[flow])),
             deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=["local"])),
         )
+
+
+def test_the_worker_has_room_for_all_deployments_at_once() -> None:
+    """Otherwise studies would keep the scan waiting, which also restarts lost runs."""
+    deployments = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
+    limits = [one["concurrency_limit"] for one in deployments]
+    room = sum(one["limit"] if isinstance(one, dict) else one for one in limits)
+    assert f"--limit {room}\n" in units(ROOT)["hnerf-worker.service"]
 
 
 def test_cron_deployment_yields_scheduled_runs_five_minutes_apart(deployed: str) -> None:
