@@ -41,7 +41,6 @@ from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.render.motion import Motion, retarget, select_poses
 
-PACKAGES = ("avatar.usdz", "avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar_cache.usdz")
 SPLATS = "avatar_splats.usdc"
 
 log = logging.getLogger("hnerf.asset")
@@ -122,7 +121,9 @@ def export_asset(
     with _timed("viewer", seconds):
         viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with _timed("validation", seconds):
-        validation = {name: validate_package(out / name) for name in (*PACKAGES, *([SPLATS] if splats else []))}
+        resampled = [f"avatar_{rate}.usda" for rate in staged.rates]
+        packages = ["avatar.usdz", "avatar.usda", *resampled, "avatar_cache.usdz", *([SPLATS] if splats else [])]
+        validation = {name: validate_package(out / name) for name in packages}
     report = _figures(capture, meshes, asset, names[0], settings) | {
         "against_field": asset.against_field,
         "crossing_share": {pose.name: pose.crossing for pose in poses},
@@ -261,7 +262,14 @@ def write_files(out: Path, avatars: Avatars, capture: Capture, info: AssetInfo, 
     write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps, info)
     write_glb(out / "avatar.glb", staged, staged.rigs[FULL])
     write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME])
-    write_avatar_bvh(out / "avatar.bvh", staged)
+    if staged.rates:
+        write_avatar_bvh(out / "avatar.bvh", staged)
+    else:
+        log.warning(
+            "%s: no avatar_24.usda, avatar_30.usda and avatar.bvh: the captured poses are too far apart to be "
+            "interpolated; list more frames in capture.toml",
+            capture.name,
+        )
     if splats:
         write_splats(out / SPLATS, staged, splats, capture.fps, info)
         write_splat_ply(out / "avatar_splats.ply", staged, splats)

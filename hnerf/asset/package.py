@@ -1,9 +1,10 @@
 """The USD files of an avatar, laid out according to OpenUSD's guidelines for asset structure.
 
 `avatar.usda` is the interface: variant sets, asset information, and payloads that lie in `avatar/`. `avatar_24.usda`
-and `avatar_30.usda` show it at 24 and 30 frames a second, for importers that ignore a file's own rate. `avatar.usdz`
-has the same prims and variants in one layer, as ARKit requires. `avatar_cache.usdz` has the surface as points at every
-frame, and `avatar_splats.usdc` has the splats, if they are wanted.
+and `avatar_30.usda` show it at 24 and 30 frames a second, for importers that ignore a file's own rate; without the
+resampled motions, there are none. `avatar.usdz` has the same prims and variants in one layer, as ARKit requires.
+`avatar_cache.usdz` has the surface as points at every frame, and `avatar_splats.usdc` has the splats, if they are
+wanted.
 
 A second avatar, of the captured mesh, adds a variant set `topology`. All other variant sets are then inside its
 variants, and the names of payloads and images start with the variant's name.
@@ -25,7 +26,7 @@ from hnerf.asset.dome import dome
 from hnerf.asset.rigs import FULL
 from hnerf.asset.splat_prim import author_splats
 from hnerf.asset.splats import Splats
-from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
+from hnerf.asset.staging import CAPTURED, StagedAvatar
 from hnerf.asset.usd import (
     ALBEDO_NAME,
     LIGHT_NAME,
@@ -80,7 +81,8 @@ class Part:
 
 
 def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
-    """Write `avatar.usda`, `avatar_24.usda`, `avatar_30.usda` and the folder `avatar/` into `out`."""
+    """Write `avatar.usda`, the same at each of the avatar's rates (`avatar_24.usda`), and the folder `avatar/` into
+    `out`."""
     folder = out / PAYLOADS
     folder.mkdir()
     _write_images(folder, avatars)
@@ -92,7 +94,7 @@ def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: f
         part.author(layer)
         layer.GetRootLayer().Save()
     _write_interface(out / INTERFACE, parts, avatars, fps, info, CAPTURED)
-    for rate in RATES:
+    for rate in next(iter(avatars.values())).rates:
         _write_interface(out / f"avatar_{rate}.usda", parts, avatars, rate, info, f"{CAPTURED}_{rate}")
 
 

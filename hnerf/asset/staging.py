@@ -20,6 +20,7 @@ from hnerf.progress import tracked
 
 CAPTURED = "captured"  # the motion at the capture's own rate, whose time codes are the capture's frames
 RATES = (24, 30)  # frames a second at which it is resampled, since many importers ignore a file's rate
+MOST_PER_POSE = 20  # resampled frames: of poses 0.7 s apart, what lies between is a guess, which takes time and space
 STILL_M = 1e-5  # points that a blend shape moves by less count as unmoved
 REST_POSE = "A"  # of every body model here: arms slanting down
 
@@ -50,6 +51,12 @@ class StagedAvatar:
     stage_from_world: np.ndarray
     albedo: Albedo | None = None
     normal_map: np.ndarray | None = None
+
+    @property
+    def rates(self) -> tuple[int, ...]:
+        """Return the rates at which the captured motion is resampled: all of RATES, or none if its poses are too far
+        apart."""
+        return tuple(rate for rate in RATES if f"{CAPTURED}_{rate}" in self.extents_m)
 
     @property
     def faces(self) -> np.ndarray:
@@ -170,10 +177,12 @@ def stage_from_world(up: str) -> np.ndarray:
 def _motions(
     clothed: BodyFit, fps: float, weights: np.ndarray, further: Mapping[str, tuple[BodyFit, float]], world: np.ndarray
 ) -> dict[str, Motion]:
-    """Return the captured motion first, then the same motion at other rates, then further ones, which have no blend
-    shapes and begin at the captured motion's first instant."""
+    """Return the captured motion first, then the same motion at other rates unless its poses are too far apart, then
+    further ones, which have no blend shapes and begin at the captured motion's first instant."""
     captured = motion_of(clothed, fps, weights, world)
-    motions = {CAPTURED: captured, **{f"{CAPTURED}_{rate}": resampled(captured, rate) for rate in RATES}}
+    motions = {CAPTURED: captured}
+    if RATES[-1] * np.ptp(captured.seconds) <= MOST_PER_POSE * len(captured.codes):
+        motions |= {f"{CAPTURED}_{rate}": resampled(captured, rate) for rate in RATES}
     for name, (body, rate) in further.items():
         motion = motion_of(body, rate, np.zeros((len(body.frames), weights.shape[1]), np.float32), world)
         motions[name] = replace(motion, codes=motion.codes - motion.codes[0] + captured.seconds[0] * rate)

@@ -25,6 +25,8 @@ SMALL = AssetSettings(
     grid_cells=96, faces=2000, level_faces=(500,), texture_px=128, photograph_frames=0, normal_map_px=64, correctives=2
 )
 
+TINY = SMALL.model_copy(update={"grid_cells": 32, "texture_px": 32, "faces": 500, "correctives": 0})
+
 
 @pytest.fixture
 def small_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,6 +151,22 @@ def test_usd_has_both_meshes_with_topology_both(tmp_path: Path) -> None:
         assert triangles == [faces, one["mesh"]["faces"]], name
 
 
+@pytest.mark.usefixtures("small_report")
+def test_files_at_other_rates_are_left_out_if_poses_are_far_apart(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """At one frame a second, the four poses take 5 s."""
+    slow, tiny = dataclasses.replace(capture(), fps=1.0), TINY.model_copy(update={"topology": "both"})
+    report = export_asset(slow, Masks({}, {}), StandInAvatar(bending_body()), tiny, tmp_path)
+    assert list(report["motions"]) == ["captured"]
+    assert not {"avatar_24.usda", "avatar_30.usda", "avatar.bvh"} & set(report["bytes"])
+    assert set(report["validation"]) == {"avatar.usda", "avatar.usdz", "avatar_cache.usdz"}
+    assert [r.message for r in caplog.records if "avatar.bvh" in r.message] == [
+        "column: no avatar_24.usda, avatar_30.usda and avatar.bvh: the captured poses are too far apart to be "
+        "interpolated; list more frames in capture.toml"
+    ]
+
+
 def test_a_motion_that_lacks_a_joint_is_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,9 +183,8 @@ def test_nothing_is_written_if_the_asset_is_far_below_its_field(
 ) -> None:
     poor = {"images": 2, "cameras": "training", "asset": {"psnr": 20.0}, "field": {"psnr": 30.0}}
     monkeypatch.setattr("hnerf.asset.export.comparison_figures", lambda compared: poor)
-    tiny = SMALL.model_copy(update={"grid_cells": 32, "texture_px": 32, "faces": 500, "correctives": 0})
     with pytest.raises(InvalidAsset, match=r"registered mesh is below its field: .* 10\.0 dB"):
-        export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), tiny, tmp_path)
+        export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), TINY, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -82,6 +82,14 @@ def test_other_frame_rates_resample_the_motion_at_whole_frames(staged: StagedAva
         np.testing.assert_allclose(surfaces_m[3 * frame - 9], true_m, atol=1e-5)
 
 
+@pytest.mark.parametrize(("last", "rates"), [(26, (24, 30)), (27, ())])
+def test_poses_far_apart_are_not_resampled(last: int, rates: tuple[int, ...]) -> None:
+    """Between frames 0 and 26 of 10 a second there are 78 frames of 30 a second for four poses; 81 are too many."""
+    staged = staged_without_shapes(dataclasses.replace(bending_body(), frames=(0, 10, 20, last)))
+    assert staged.rates == rates
+    assert list(staged.rigs["game"].motions) == ["captured", *(f"captured_{rate}" for rate in rates)]
+
+
 def test_progress_is_reported_while_bounding_boxes_are_computed() -> None:
     heard: list[Progress] = []
     with listening(heard.append):
