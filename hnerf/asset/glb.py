@@ -17,7 +17,7 @@ from hnerf.asset.texture import UvLayout
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
 RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # left out: glTF times are in seconds
-VARIANTS = "KHR_materials_variants"
+VARIANTS, SPECULAR = "KHR_materials_variants", "KHR_materials_specular"
 DENSE_SHARE = 0.75  # of the vertices; if a blend shape moves more, 4-byte indices cost more than 12-byte zeros
 STILL = 1e-6  # metres or radians; a joint that moves less gets no channel
 SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
@@ -158,18 +158,20 @@ def _vertex_data(writer: GlbWriter, values: np.ndarray, dtype: type) -> int:
 def _add_materials(writer: GlbWriter, avatar: StagedAvatar, primitive: gltf.Primitive) -> None:
     """Add the captured look, which the primitive uses, and, if there is an albedo, a material variant for it."""
     document = writer.document
+    document.extensionsUsed = [SPECULAR]
     document.samplers.append(gltf.Sampler(wrapS=gltf.CLAMP_TO_EDGE, wrapT=gltf.CLAMP_TO_EDGE))
     looks = {"captured": avatar.texture} | ({"albedo": avatar.albedo.texture} if avatar.albedo else {})
     normals = None if avatar.normal_map is None else _add_texture(writer, avatar.normal_map)
     for name, texture in looks.items():
         colours = gltf.TextureInfo(index=_add_texture(writer, texture))
         matte = gltf.PbrMetallicRoughness(baseColorTexture=colours, metallicFactor=0.0, roughnessFactor=1.0)
-        material = gltf.Material(name=name.capitalize(), pbrMetallicRoughness=matte)
+        no_sheen = {SPECULAR: {"specularFactor": 0.0}}  # what there was is already in the colours
+        material = gltf.Material(name=name.capitalize(), pbrMetallicRoughness=matte, extensions=no_sheen)
         if normals is not None:
             material.normalTexture = gltf.NormalMaterialTexture(index=normals)
         document.materials.append(material)
     if len(looks) > 1:
-        document.extensionsUsed = [VARIANTS]
+        document.extensionsUsed.append(VARIANTS)
         document.extensions = {VARIANTS: {"variants": [{"name": name} for name in looks]}}
         mappings = [{"material": k, "variants": [k]} for k in range(len(looks))]
         primitive.extensions = {VARIANTS: {"mappings": mappings}}
