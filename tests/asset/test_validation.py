@@ -154,6 +154,17 @@ def test_an_eye_joint_off_the_centre_of_its_eyeball_is_reported(stage: Usd.Stage
         assert ("does not turn about" in "; ".join(data_defects(stage))) is wrong
 
 
+def test_a_small_child_may_squat(package: Path) -> None:
+    """The cache of a column of 1.7 m, at a quarter of its size, has only posed surfaces, which may have any size."""
+    stage = Usd.Stage.Open(str(package / "avatar_cache.usdz"))
+    stage.SetEditTarget(stage.GetSessionLayer())
+    surface = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Surface"))
+    for attribute in (surface.GetPointsAttr(), surface.GetExtentAttr()):
+        for time in attribute.GetTimeSamples():
+            attribute.Set(Vt.Vec3fArray.FromNumpy(np.array(attribute.Get(time)) / 4), time)
+    assert data_defects(stage) == []
+
+
 def test_an_albedo_without_its_light_is_reported(stage: Usd.Stage) -> None:
     stage.SetEditTarget(stage.GetSessionLayer())
     stage.GetDefaultPrim().GetVariantSet("look").SetVariantSelection("albedo")
