@@ -179,7 +179,7 @@ def test_a_slider_turns_its_joint_on_top_of_the_motion(page: Page) -> None:
 @NEEDS_THREE
 def test_a_slider_adds_to_the_weight_of_a_shape(page: Page, staged: StagedAvatar) -> None:
     page.evaluate("viewer.setTime(0.2)")
-    weights = "viewer.avatar.meshes[0].morphTargetInfluences.slice()"
+    weights = "viewer.avatar.mesh.morphTargetInfluences.slice()"
     before, picture = page.evaluate(weights), page.evaluate(PICTURE)
     page.evaluate(move("#weights input", 0.5, "input"))
     np.testing.assert_allclose(page.evaluate(weights), np.add(before, np.eye(len(before))[0] / 2), atol=1e-6)

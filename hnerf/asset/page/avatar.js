@@ -1,4 +1,4 @@
-// The avatar of a glTF file: its meshes, joints and motions, and what the user adds to them.
+// The avatar of a file that hnerf/asset/glb.py wrote: its mesh, joints and motions, and what the user adds to them.
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/GLTFLoader.js";
@@ -14,16 +14,14 @@ export class Avatar {
   constructor(gltf) {
     this.root = gltf.scene;
     this.motions = gltf.animations;
-    this.meshes = [];
-    this.root.traverse((node) => node.isMesh && this.meshes.push(node));
-    for (const mesh of this.meshes) mesh.frustumCulled = false; // its bounds are those of the rest pose
-    const skinned = this.meshes.filter((mesh) => mesh.isSkinnedMesh);
-    useAllInfluences(skinned);
-    this.joints = [...new Set(skinned.flatMap((mesh) => mesh.skeleton.bones))];
-    this.inverses = new Map(skinned.flatMap(({ skeleton }) => skeleton.bones.map((b, i) => [b, skeleton.boneInverses[i]])));
-    this.shares = jointShares(skinned);
+    this.root.traverse((node) => node.isSkinnedMesh && (this.mesh = node)); // there is one
+    this.mesh.frustumCulled = false; // its bounds are those of the rest pose
+    useAllInfluences(this.mesh.geometry);
+    this.joints = this.mesh.skeleton.bones;
+    this.inverses = new Map(this.joints.map((joint, j) => [joint, this.mesh.skeleton.boneInverses[j]]));
+    this.shares = jointShares(this.mesh);
     this.turns = new Map(this.joints.map((joint) => [joint, new THREE.Euler()]));
-    this.shapes = shapesOf(this.meshes, this.motions);
+    this.shapes = shapesOf(this.mesh, this.motions);
     this.mixer = new THREE.AnimationMixer(this.root);
     this.motion = null;
     this.time = 0;
@@ -59,24 +57,20 @@ export class Avatar {
     }
     this.animated = this.snapshot();
     for (const [joint, turn] of this.turns) joint.quaternion.multiply(new THREE.Quaternion().setFromEuler(turn));
-    for (const shape of this.shapes) {
-      for (const { mesh, index } of shape.targets) mesh.morphTargetInfluences[index] += shape.added;
-    }
+    for (const { index, added } of this.shapes) this.mesh.morphTargetInfluences[index] += added;
     this.root.updateMatrixWorld(true);
   }
 
   snapshot() {
     return {
       quaternions: this.joints.map((joint) => joint.quaternion.clone()),
-      weights: this.meshes.map((mesh) => mesh.morphTargetInfluences?.slice()),
+      weights: this.mesh.morphTargetInfluences?.slice(),
     };
   }
 
   restore() {
     this.joints.forEach((joint, j) => joint.quaternion.copy(this.animated.quaternions[j]));
-    this.meshes.forEach((mesh, m) => {
-      this.animated.weights[m]?.forEach((weight, k) => (mesh.morphTargetInfluences[k] = weight));
-    });
+    this.animated.weights?.forEach((weight, k) => (this.mesh.morphTargetInfluences[k] = weight));
   }
 
   // Returns the bounds of the motion's first instant, the height of the ground (the median of its lowest points), and
@@ -85,17 +79,11 @@ export class Avatar {
     const count = this.motion ? GROUND_SAMPLES : 1;
     const boxes = Array.from({ length: count }, (_, sample) => {
       this.pose((this.duration * sample) / count);
-      return this.box();
+      return posedBox(this.mesh);
     });
     this.pose(0);
     const lowest = boxes.map((box) => box.min.y).sort((a, b) => a - b);
     return { box: boxes[0], ground: lowest[Math.floor(count / 2)], forward: this.forward() };
-  }
-
-  box() {
-    const box = new THREE.Box3();
-    for (const mesh of this.meshes) box.union(mesh.isSkinnedMesh ? posedBox(mesh) : new THREE.Box3().setFromObject(mesh));
-    return box;
   }
 
   // A glTF file's front is +z at rest; returns where the joints turn it, by their shares of the surface.
@@ -105,37 +93,28 @@ export class Avatar {
       const front = new THREE.Vector3(0, 0, 1).transformDirection(this.inverses.get(joint));
       sum.addScaledVector(front.transformDirection(joint.matrixWorld), share);
     }
-    return sum.length() ? sum.normalize() : new THREE.Vector3(0, 0, 1);
+    return sum.normalize();
   }
 
   get heaviest() {
-    return this.joints.reduce((best, other) => ((this.shares.get(other) ?? 0) > (this.shares.get(best) ?? 0) ? other : best));
+    return [...this.shares].reduce((best, other) => (other[1] > best[1] ? other : best))[0];
   }
 
   // Returns the mean place of the joints.
   centre() {
     const sum = new THREE.Vector3();
     for (const joint of this.joints) sum.add(new THREE.Vector3().setFromMatrixPosition(joint.matrixWorld));
-    return sum.divideScalar(Math.max(1, this.joints.length));
+    return sum.divideScalar(this.joints.length);
   }
 }
 
-// Returns the blend shapes: one for each name, which several meshes may share, with the largest weight that a motion
-// gives it, and whether any motion uses it; those that none uses are expressions and physiques.
-function shapesOf(meshes, motions) {
-  const shapes = new Map();
-  for (const mesh of meshes) {
-    for (const [key, index] of Object.entries(mesh.morphTargetDictionary ?? {})) {
-      const name = /^\d+$/.test(key) ? `Shape ${Number(key) + 1}` : key;
-      if (!shapes.has(name)) shapes.set(name, { name, targets: [], added: 0, largest: 1, moves: false });
-      const shape = shapes.get(name);
-      shape.targets.push({ mesh, index });
-      const weight = largestWeight(mesh, index, motions);
-      shape.largest = Math.max(shape.largest, weight);
-      shape.moves ||= weight > 0;
-    }
-  }
-  return [...shapes.values()];
+// Returns the blend shapes with the largest weight that a motion gives each, and whether any motion uses it; those that
+// none uses are expressions and physiques.
+function shapesOf(mesh, motions) {
+  return Object.entries(mesh.morphTargetDictionary ?? {}).map(([name, index]) => {
+    const largest = largestWeight(mesh, index, motions);
+    return { name, index, added: 0, largest: Math.max(1, largest), moves: largest > 0 };
+  });
 }
 
 function largestWeight(mesh, index, motions) {

@@ -2,14 +2,9 @@
 
 import * as THREE from "three";
 
-export function useAllInfluences(meshes) {
-  const sets = new Set(meshes.flatMap((mesh) => furtherSets(mesh.geometry)));
-  for (const { geometry } of meshes) {
-    const own = furtherSets(geometry);
-    restoreFirstFour(geometry, own);
-    for (const set of sets) if (!own.includes(set)) addNoInfluence(geometry, set);
-  }
-  for (const set of sets) extendShader(set);
+export function useAllInfluences(geometry) {
+  restoreFirstFour(geometry);
+  for (const set of furtherSets(geometry)) extendShader(set);
 }
 
 // Returns each vertex' joints and weights, as a function of the vertex that yields [joint, weight].
@@ -45,14 +40,12 @@ export function posedBox(mesh) {
 }
 
 // Returns the sum of weights of every joint that moves a vertex.
-export function jointShares(meshes) {
+export function jointShares({ geometry, skeleton }) {
   const sums = new Map();
-  for (const { geometry, skeleton } of meshes) {
-    const influences = influencesOf(geometry);
-    for (let vertex = 0; vertex < geometry.attributes.position.count; vertex++) {
-      for (const [index, weight] of influences(vertex)) {
-        sums.set(skeleton.bones[index], (sums.get(skeleton.bones[index]) ?? 0) + weight);
-      }
+  const influences = influencesOf(geometry);
+  for (let vertex = 0; vertex < geometry.attributes.position.count; vertex++) {
+    for (const [index, weight] of influences(vertex)) {
+      sums.set(skeleton.bones[index], (sums.get(skeleton.bones[index]) ?? 0) + weight);
     }
   }
   return sums;
@@ -64,8 +57,9 @@ function furtherSets(geometry) {
 }
 
 // The loader scaled the first four weights of a vertex to a sum of one.
-function restoreFirstFour(geometry, sets) {
+function restoreFirstFour(geometry) {
   const first = geometry.attributes.skinWeight;
+  const sets = furtherSets(geometry);
   for (let vertex = 0; vertex < first.count; vertex++) {
     let share = 1;
     for (const set of sets) {
@@ -73,12 +67,6 @@ function restoreFirstFour(geometry, sets) {
     }
     for (let c = 0; c < 4; c++) first.setComponent(vertex, c, Math.max(0, share) * first.getComponent(vertex, c));
   }
-}
-
-function addNoInfluence(geometry, set) {
-  const none = new THREE.BufferAttribute(new Float32Array(4 * geometry.attributes.position.count), 4);
-  geometry.setAttribute(`joints_${set}`, none);
-  geometry.setAttribute(`weights_${set}`, none);
 }
 
 function extendShader(set) {

@@ -9,31 +9,29 @@ const WIRE = 0x2f6fb5;
 const RAMP = [0x26324a, 0x2a6f97, 0x52b788, 0xf9c74f, 0xe63946].map((c) => new THREE.Color(c)); // weights 0 to 1
 
 export class Looks {
-  constructor(meshes) {
-    this.parts = meshes.map((mesh) => ({ mesh, materials: materialsOf(mesh.material), wires: wiresOf(mesh) }));
+  constructor(mesh) {
+    this.mesh = mesh;
+    this.materials = materialsOf(mesh.material);
+    this.wires = wiresOf(mesh);
     this.show("Textured");
   }
 
   show(look) {
-    this.look = look;
-    for (const { mesh, materials, wires } of this.parts) {
-      mesh.material = materials[look];
-      wires.visible = look === "Wireframe";
-    }
+    this.mesh.material = this.materials[look];
+    this.wires.visible = look === "Wireframe";
   }
 
   colourByWeights(joint) {
-    for (const { mesh } of this.parts) {
-      const colours = new Float32Array(3 * mesh.geometry.attributes.position.count);
-      const bone = mesh.isSkinnedMesh ? mesh.skeleton.bones.indexOf(joint) : -1;
-      const influences = mesh.isSkinnedMesh ? influencesOf(mesh.geometry) : () => [];
-      for (let vertex = 0; vertex < colours.length / 3; vertex++) {
-        let weight = 0;
-        for (const [index, share] of influences(vertex)) if (index === bone) weight += share;
-        ramp(weight).toArray(colours, 3 * vertex);
-      }
-      mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
+    const { geometry, skeleton } = this.mesh;
+    const colours = new Float32Array(3 * geometry.attributes.position.count);
+    const bone = skeleton.bones.indexOf(joint);
+    const influences = influencesOf(geometry);
+    for (let vertex = 0; vertex < colours.length / 3; vertex++) {
+      let weight = 0;
+      for (const [index, share] of influences(vertex)) if (index === bone) weight += share;
+      ramp(weight).toArray(colours, 3 * vertex);
     }
+    geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
   }
 }
 
@@ -43,22 +41,21 @@ function ramp(weight) {
   return RAMP[step].clone().lerp(RAMP[step + 1], place - step);
 }
 
-function materialsOf(own) {
-  const { map, color, side, normalMap, normalScale, transparent, alphaTest, opacity } = own;
+function materialsOf({ map, normalMap, normalScale }) {
   const pushedBack = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
-  const clay = { color: CLAY, side, normalMap, normalScale, roughness: 0.9 };
+  const clay = { color: CLAY, normalMap, normalScale, roughness: 0.9 };
   return {
-    Textured: new THREE.MeshBasicMaterial({ map, color, side, transparent, alphaTest, opacity }), // light is in the texture
+    Textured: new THREE.MeshBasicMaterial({ map }), // light is in the texture
     Clay: new THREE.MeshStandardMaterial(clay),
     Wireframe: new THREE.MeshStandardMaterial({ ...clay, color: 0xe9e6e1, ...pushedBack }),
-    Weights: new THREE.MeshStandardMaterial({ vertexColors: true, side, roughness: 1 }),
+    Weights: new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 1 }),
   };
 }
 
 function wiresOf(mesh) {
   const material = new THREE.MeshBasicMaterial({ color: WIRE, wireframe: true, transparent: true, opacity: 0.5 });
-  const wires = mesh.isSkinnedMesh ? new THREE.SkinnedMesh(mesh.geometry, material) : new THREE.Mesh(mesh.geometry, material);
-  if (mesh.isSkinnedMesh) wires.bind(mesh.skeleton, mesh.bindMatrix);
+  const wires = new THREE.SkinnedMesh(mesh.geometry, material);
+  wires.bind(mesh.skeleton, mesh.bindMatrix);
   wires.morphTargetInfluences = mesh.morphTargetInfluences; // the same array
   wires.frustumCulled = false;
   mesh.add(wires);

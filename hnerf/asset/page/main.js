@@ -17,7 +17,7 @@ export async function main(bytes, recording) {
     avatar,
     stage,
     recording,
-    looks: new Looks(avatar.meshes),
+    looks: new Looks(avatar.mesh),
     photographs: new Photographs(find("photograph"), find("caption"), recording.fps),
     skeleton: new THREE.SkeletonHelper(avatar.root),
     axes: new THREE.AxesHelper(0.15),
@@ -88,7 +88,7 @@ function connectMotion(viewer) {
     const frame = Math.round(avatar.time * recording.fps) + frames;
     viewer.setTime(Math.min(Math.max(0, frame / recording.fps), avatar.duration));
   };
-  options(find("motion"), motions.map((motion, index) => (motion ? motion.name || `Motion ${index + 1}` : REST)));
+  options(find("motion"), motions.map((motion) => motion?.name ?? REST));
   find("motion").addEventListener("change", (event) => {
     viewer.setMotion(Number(event.target.value));
     stage.frame(viewer.bounds);
@@ -176,7 +176,6 @@ function connectJoints(viewer) {
     for (const turn of avatar.turns.values()) turn.set(0, 0, 0);
     choose();
   });
-  if (!avatar.joints.length) return;
   find("joint").value = avatar.joints.indexOf(avatar.heaviest);
   choose();
 }
