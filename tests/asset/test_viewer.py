@@ -189,6 +189,20 @@ def test_a_slider_adds_to_the_weight_of_a_shape(page: Page, staged: StagedAvatar
 
 
 @NEEDS_THREE
+def test_shapes_that_a_motion_uses_are_found_in_long_motions_too(page: Page) -> None:
+    """In a motion of 200 000 poses with five weights each, the last pose alone uses the fourth shape."""
+    shapes = page.evaluate(
+        "import('viewer/avatar.js').then(({ shapesOf }) => {"
+        "  const values = new Float32Array(1_000_000); values[999_998] = 0.5;"
+        "  const track = { name: 'Surface.morphTargetInfluences', values };"
+        "  return shapesOf(viewer.avatar.mesh, [{ tracks: [track] }]);"
+        "})"
+    )
+    assert [shape["name"] for shape in shapes if shape["moves"]] == ["frown"]
+    assert page.evaluate("viewer.avatar.shapes.map(({ moves }) => moves)") == [True, True, True, False, False]
+
+
+@NEEDS_THREE
 def test_the_person_is_framed_from_the_front(page: Page, staged: StagedAvatar) -> None:
     low, high = page.evaluate("[viewer.bounds.box.min.toArray(), viewer.bounds.box.max.toArray()]")
     np.testing.assert_allclose([low, high], [staged.points_m[0].min(0), staged.points_m[0].max(0)], atol=5e-5)

@@ -108,18 +108,13 @@ export class Avatar {
   }
 }
 
-// Returns the blend shapes with the largest weight that a motion gives each, and whether any motion uses it; those that
-// none uses are expressions and physiques.
-function shapesOf(mesh, motions) {
-  return Object.entries(mesh.morphTargetDictionary ?? {}).map(([name, index]) => {
-    const largest = largestWeight(mesh, index, motions);
-    return { name, index, added: 0, largest: Math.max(1, largest), moves: largest > 0 };
-  });
-}
-
-function largestWeight(mesh, index, motions) {
-  const count = mesh.morphTargetInfluences.length;
-  const tracks = motions.flatMap((motion) => motion.tracks);
-  const own = tracks.filter((track) => track.name === `${mesh.name}.morphTargetInfluences`);
-  return Math.max(0, ...own.flatMap(({ values }) => [...values].filter((_, i) => i % count === index).map(Math.abs)));
+// Returns the blend shapes, and whether a motion uses them; those that none uses are expressions and physiques.
+export function shapesOf(mesh, motions) {
+  const names = Object.keys(mesh.morphTargetDictionary ?? {}); // in the order of the file
+  const shapes = names.map((name, index) => ({ name, index, added: 0, moves: false }));
+  for (const { name, values } of motions.flatMap((motion) => motion.tracks)) {
+    if (!name.endsWith(".morphTargetInfluences")) continue;
+    values.forEach((weight, i) => (shapes[i % shapes.length].moves ||= weight > 0));
+  }
+  return shapes;
 }

@@ -184,7 +184,7 @@ function connectShapes(viewer) {
   const { avatar } = viewer;
   const again = () => viewer.setTime(avatar.time);
   const sliders = avatar.shapes.map((shape) => {
-    const range = [shape.moves ? -shape.largest : 0, shape.largest, shape.largest / 100];
+    const range = [shape.moves ? -1 : 0, 1, 0.01]; // a motion's own weights are from 0 to 1
     return slider(find("weights"), shape.name, range, (value) => value.toFixed(2), (value) => {
       shape.added = value;
       again();
