@@ -187,9 +187,11 @@ def _add_texture(writer: GlbWriter, image: np.ndarray) -> int:
 
 def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton, shapes: int) -> gltf.Animation:
     """Add channels for what moves: joints that leave their transform at rest, and the weights of the correctives. The
-    expressions and physiques that follow the correctives, up to `shapes` in all, have weight 0."""
+    expressions and physiques that follow the correctives, up to `shapes` in all, have weight 0. If all weights are 0,
+    the first and the last pose alone say so, in case another motion left the weights at other values."""
     animation = gltf.Animation(name=name, channels=[], samplers=[])
-    times = writer.accessor(((motion.codes - motion.codes[0]) / motion.fps).astype(np.float32))
+    seconds = ((motion.codes - motion.codes[0]) / motion.fps).astype(np.float32)
+    times = writer.accessor(seconds)
 
     def animate(node: int, path: str, values: np.ndarray) -> None:
         output = writer.accessor(values.astype(np.float32))
@@ -206,5 +208,7 @@ def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skel
             animate(joint, "rotation", motion.quaternions[:, joint])
     if motion.shape_weights.size:
         weights = np.pad(motion.shape_weights, ((0, 0), (0, shapes - motion.shape_weights.shape[1])))
+        if len(weights) > 2 and not weights.any():
+            weights, times = weights[:2], writer.accessor(seconds[[0, -1]])
         animate(len(skeleton.names), "weights", weights.ravel())
     return animation

@@ -199,6 +199,20 @@ def test_correctives_are_morph_targets_with_one_weight_per_frame(glb: Path, stag
     assert (weights[:, -2:] == 0).all()  # the motion does not use the expression and the physique
 
 
+def test_weights_that_stay_zero_have_two_keys(staged: StagedAvatar, tmp_path: Path) -> None:
+    full = staged.rigs["full"]
+    still = {
+        name: dataclasses.replace(motion, shape_weights=0 * motion.shape_weights)
+        for name, motion in full.motions.items()
+    }
+    write_glb(tmp_path / "still.glb", staged, dataclasses.replace(full, motions=still))
+    document = pygltflib.GLTF2.load(str(tmp_path / "still.glb"))
+    *_, joint, weights = document.animations[0].samplers
+    np.testing.assert_allclose(accessor(document, weights.input)[:, 0], [0, 0.5])
+    np.testing.assert_array_equal(accessor(document, weights.output), np.zeros((2 * 5, 1)))
+    assert document.accessors[joint.input].count == len(FRAMES)
+
+
 def test_expressions_and_physiques_are_morph_targets_after_the_correctives(glb: Path, staged: StagedAvatar) -> None:
     document = pygltflib.GLTF2.load(str(glb))
     (mesh,) = document.meshes
