@@ -15,11 +15,12 @@ import numpy as np
 
 from hnerf.asset.compact_glb import compact_glb
 from hnerf.capture.capture import Capture
+from hnerf.errors import InputError
 from hnerf.evaluation.pictures import data_uri, shrunk
 from hnerf.evaluation.report import report_environment
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
-from hnerf.models import LICENCES, THREE_SHA256, has_model, model_file
+from hnerf.models import LICENCES, THREE_SHA256, model_file
 
 PAGE = Path(__file__).parent / "page"
 MAX_BYTES = 8_000_000
@@ -39,8 +40,10 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
     stage_from_world (3, 3): from the capture's world to the avatar's. The texture is halved until the page has at most
     MAX_BYTES; if that does not suffice, a warning is logged.
     """
-    if any(not has_model(name) for name in THREE_SHA256):
-        reason = f"no {path.name}: three.js is not installed; `hnerf models` downloads it"
+    try:
+        modules = _modules()
+    except InputError as error:
+        reason = f"no {path.name}: {error}"
         log.warning("%s", reason)
         return reason
     parts: dict[str, Any] = {
@@ -48,7 +51,7 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
         "style": (PAGE / "viewer.css").read_text(encoding="utf-8"),
         "boot": (PAGE / "boot.js").read_text(encoding="utf-8"),
         "licence": (LICENCES / "three.txt").read_text(encoding="utf-8"),
-        "modules": _packed(json.dumps(_modules()).encode()),
+        "modules": _packed(json.dumps(modules).encode()),
         "recording": _packed(json.dumps(recording(capture, stage_from_world)).encode()),
     }
     template = report_environment(PAGE).get_template("viewer.html")
@@ -101,7 +104,8 @@ def _photograph(capture: Capture, camera: str, frame: int) -> dict[str, Any]:
 
 
 def _modules() -> dict[str, str]:
-    """Return the sources by the names under which they import each other: "three", "three/..." and "viewer/..."."""
+    """Return the sources by the names under which they import each other: "three", "three/..." and "viewer/...". Raises
+    InputError if a file of three.js is missing or altered."""
     three = {f"three/{name}": model_file(name).read_text(encoding="utf-8") for name in THREE_SHA256}
     three = {name: RELATIVE_IMPORT.sub(r"from 'three/\1'", source) for name, source in three.items()}
     paths = [path for path in sorted(PAGE.glob("*.js")) if path.name != "boot.js"]

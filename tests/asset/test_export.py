@@ -100,7 +100,7 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
     )
     assert json.loads((tmp_path / "report.json").read_text()) == report
     assert set(report["bytes"]) == FILES
-    assert report["viewer"].startswith("no viewer.html: three.js is not installed")
+    assert report["viewer"].startswith("no viewer.html: ") and report["viewer"].endswith("; run `hnerf models`")
     page = (tmp_path / "report.html").read_text()
     # In frame 3 the body, which faces -Y, is turned by 2.4 rad about Z: to (sin, -cos, 0), in the stage (sin, 0, cos).
     np.testing.assert_allclose(shown_from[0], [np.sin(2.4), 0, np.cos(2.4)], atol=1e-6)

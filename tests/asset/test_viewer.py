@@ -66,13 +66,18 @@ def page(viewer: Path) -> Iterator[Page]:
         yield opened
 
 
-def test_without_three_js_a_reason_is_given_and_no_page_is_written(
+def test_without_intact_three_js_a_reason_is_given_and_no_page_is_written(
     staged: StagedAvatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
-    reason = write_viewer(tmp_path / "viewer.html", tmp_path / "avatar.glb", capture(), staged.stage_from_world)
-    assert reason == "no viewer.html: three.js is not installed; `hnerf models` downloads it"
-    assert not list(tmp_path.iterdir())
+    models = tmp_path / "models"
+    monkeypatch.setenv("HNERF_MODELS", str(models))
+    page = tmp_path / "viewer.html"
+    for found in ("not there", "altered or damaged"):
+        reason = write_viewer(page, tmp_path / "avatar.glb", capture(), staged.stage_from_world)
+        assert reason == f"no viewer.html: {models}/{next(iter(THREE_SHA256))}: {found}; run `hnerf models`"
+        models.mkdir(exist_ok=True)
+        (models / next(iter(THREE_SHA256))).write_text("// an older version")
+    assert not page.exists()
 
 
 def test_cameras_and_photographs_are_in_the_avatars_world(photographed: Capture, staged: StagedAvatar) -> None:
