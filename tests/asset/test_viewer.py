@@ -43,10 +43,13 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 @pytest.fixture(scope="module")
 def viewer(staged: StagedAvatar, photographed: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write the page of an avatar whose vertices are moved only by their fifth and later joints."""
+    """Write the page of an avatar whose vertices are moved only by their fifth and later joints. A further motion has
+    the four captured poses at 30 frames a second."""
     folder = tmp_path_factory.mktemp("viewer")
-    glb = folder / "avatar.glb"
-    write_avatar(glb, staged)
+    glb, full = folder / "avatar.glb", staged.rigs["full"]
+    fast = dataclasses.replace(full.motions["captured"], fps=30.0, codes=np.arange(4.0))
+    full = dataclasses.replace(full, motions=full.motions | {"fast": fast})
+    write_avatar(glb, dataclasses.replace(staged, rigs={"full": full}))
     glb.write_bytes(with_joints_in_second_set(glb.read_bytes()))
     written = write_viewer(folder / "viewer.html", glb, photographed, staged.stage_from_world)
     assert written == "viewer.html"
@@ -160,6 +163,19 @@ def test_the_page_plays_and_pauses_the_motion(page: Page) -> None:
     page.press(".")
     assert page.evaluate("viewer.avatar.time") == pytest.approx(0.2)
     assert page.evaluate("document.getElementById('clock').textContent") == "frame 5 · 0.20 s"
+
+
+@NEEDS_THREE
+def test_each_motion_is_stepped_through_at_its_own_rate_to_its_last_frame(page: Page) -> None:
+    """Rounded to floats, three frames of 1/30 s are longer than 0.1 s."""
+    page.evaluate("viewer.setMotion(1)")
+    page.press(".")
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(1 / 30)
+    page.evaluate(move("#time", 10, "input"))
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.1)
+    page.evaluate("viewer.setMotion(0)")
+    page.press(".")
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.1)
 
 
 @NEEDS_THREE

@@ -8,6 +8,7 @@ import { Photographs } from "viewer/photographs.js";
 import { Stage } from "viewer/stage.js";
 
 const REST = "Rest pose";
+const MARGIN_FRAMES = 0.01; // after the time slider's last frame, which rounding to floats may put past the end
 const find = (id) => document.getElementById(id);
 
 export async function main(bytes, recording) {
@@ -76,7 +77,10 @@ function connectMotion(viewer) {
     viewer.bounds = avatar.bounds();
     stage.followed = null;
     find("motion").value = index;
-    Object.assign(find("time"), { max: avatar.duration, step: 1 / recording.fps, disabled: !avatar.duration });
+    const [, second] = avatar.showsRecording ? [] : (motions[index]?.tracks[0].times ?? []);
+    viewer.frameTime = second || 1 / recording.fps;
+    const max = avatar.duration + MARGIN_FRAMES * viewer.frameTime;
+    Object.assign(find("time"), { max, step: viewer.frameTime, disabled: !avatar.duration });
     viewer.setTime(0);
   };
   viewer.play = (playing) => {
@@ -85,8 +89,8 @@ function connectMotion(viewer) {
   };
   viewer.step = (frames) => {
     viewer.play(false);
-    const frame = Math.round(avatar.time * recording.fps) + frames;
-    viewer.setTime(Math.min(Math.max(0, frame / recording.fps), avatar.duration));
+    const frame = Math.round(avatar.time / viewer.frameTime) + frames;
+    viewer.setTime(Math.min(Math.max(0, frame * viewer.frameTime), avatar.duration));
   };
   options(find("motion"), motions.map((motion) => motion?.name ?? REST));
   find("motion").addEventListener("change", (event) => {
