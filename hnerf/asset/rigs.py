@@ -112,7 +112,8 @@ def _motions(
         stage[name] = skeleton.posed(poses[name], ground_transforms(poses[name][:, 0], floor_m))
         local = skeleton.local(stage[name])
         quaternions = continuous_quaternions(local[..., :3, :3])
-        moving[name] = JointMotion(motion.fps, motion.codes, local[..., :3, 3], quaternions, motion.shape_weights)
+        translations_m = local[..., :3, 3].copy()  # a view would keep the matrices
+        moving[name] = JointMotion(motion.fps, motion.codes, translations_m, quaternions, motion.shape_weights)
     return moving, stage
 
 

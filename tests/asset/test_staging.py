@@ -70,6 +70,10 @@ def test_both_rigs_reproduce_the_bodys_surface(staged: StagedAvatar) -> None:
             np.testing.assert_allclose(found_m, true_m, atol=1e-5)
 
 
+def test_translations_do_not_keep_the_joints_matrices(staged: StagedAvatar) -> None:
+    assert all(motion.translations_m.base is None for motion in staged.rigs["full"].motions.values())
+
+
 def test_other_frame_rates_resample_the_motion_at_whole_frames(staged: StagedAvatar) -> None:
     """Frames 3 to 8 at 10 a second run from 0.3 to 0.8 s: codes 8 to 19 at 24 a second, and 9 to 24 at 30, which
     include every captured frame."""
