@@ -26,7 +26,7 @@ from hnerf.asset.dome import dome
 from hnerf.asset.rigs import FULL
 from hnerf.asset.splat_prim import author_splats
 from hnerf.asset.splats import Splats
-from hnerf.asset.staging import CAPTURED, StagedAvatar
+from hnerf.asset.staging import CAPTURED, StagedAvatar, box
 from hnerf.asset.usd import (
     ALBEDO_NAME,
     LIGHT_NAME,
@@ -265,11 +265,10 @@ def _set_units(stage: Usd.Stage, fps: float) -> None:
 
 
 def _everywhere(avatar: StagedAvatar) -> np.ndarray:
-    """Return points (n, 3) whose bounding box contains the surface at rest, in all motions and physiques, and in the
-    cache."""
-    corners = [avatar.rest_points_m, *(boxes.reshape(-1, 3) for boxes in avatar.extents_m.values())]
-    corners += [physique_box(avatar, name) for name in avatar.physiques_m]
-    return np.concatenate([*corners, avatar.points_m.reshape(-1, 3)])
+    """Return the corners (n, 3) of boxes around the surface at rest, in all motions and physiques, and in the cache."""
+    corners = [box(avatar.rest_points_m), box(avatar.points_m.reshape(-1, 3))]
+    corners += [boxes.reshape(-1, 3) for boxes in avatar.extents_m.values()]
+    return np.concatenate([*corners, *(physique_box(avatar, name) for name in avatar.physiques_m)])
 
 
 def _package(stage: Usd.Stage, avatars: Avatars, path: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdSkel
 
 from hnerf.asset.rigs import GAME, GAME_INFLUENCES
-from hnerf.asset.staging import CAPTURED, RATES
+from hnerf.asset.staging import CAPTURED, RATES, box
 from hnerf.body.skeletons import PELVIS, ROOT
 
 SAME = 1e-4  # metres, or parts of 1, by which values that must agree may differ
@@ -56,7 +56,7 @@ def _eyes_off(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, skele
     ):
         name = token.rpartition("/")[2]
         if name.startswith("eye_") and len(ball := points[((joints == j) & (weights > 0)).any(1)]):
-            low, high = ball.min(0), ball.max(0)
+            low, high = box(ball)
             if np.linalg.norm(bind.ExtractTranslation() - (low + high) / 2) > EYE_OFF * (high - low).min() / 2:
                 off.append(name)
     return off

@@ -5,7 +5,7 @@ from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 
 from hnerf.asset.rigs import FULL
 from hnerf.asset.splats import OPACITY, Splats
-from hnerf.asset.staging import CAPTURED, StagedAvatar
+from hnerf.asset.staging import CAPTURED, StagedAvatar, box
 from hnerf.asset.usd import ROOT, extent, vec3f
 
 SIGMAS = 3  # from a splat's centre to the end of its box
@@ -26,7 +26,7 @@ def author_splats(stage: Usd.Stage, avatar: StagedAvatar, splats: Splats) -> Non
     surfaces_m = avatar.rigs[FULL].surfaces_m(CAPTURED, avatar.rest)
     for frame, surface_m in zip(avatar.frames.astype(float).tolist(), surfaces_m, strict=True):
         middles_m, _, quaternions = splats.on(surface_m)
-        box_m = np.stack([middles_m.min(0), middles_m.max(0)]) + SIGMAS * splats.sigma_m * np.array([[-1], [1]])
+        box_m = box(middles_m) + SIGMAS * splats.sigma_m * np.array([[-1], [1]])
         positions.Set(vec3f(middles_m), frame)
         # USD keeps the real part last.
         orientations.Set(Vt.QuathArray.FromNumpy(quaternions[:, [1, 2, 3, 0]].astype(np.float16)), frame)

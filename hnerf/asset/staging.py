@@ -162,6 +162,11 @@ def _turned(shapes_m: Mapping[str, np.ndarray] | None, rotation: np.ndarray) -> 
     return {name: moved_m @ rotation.T.astype(np.float32) for name, moved_m in (shapes_m or {}).items()}
 
 
+def box(points_m: np.ndarray) -> np.ndarray:
+    """Return the lower and the upper corner (2, 3) of the box around points (n, 3)."""
+    return np.stack([points_m.min(0), points_m.max(0)])
+
+
 def moved_points(offsets_m: np.ndarray) -> np.ndarray:
     """Return which points a blend shape (V, 3) moves, (n,); the first one if it moves none, since formats take an empty
     list for all points."""
@@ -192,4 +197,4 @@ def _motions(
 def _boxes(rig: StagedRig, motion: str, rest: RestSurface) -> np.ndarray:
     """Return the box (2, 3) of the surface at each time code of a motion, (n, 2, 3)."""
     surfaces_m = tracked(rig.surfaces_m(motion, rest), f"boxes of {motion}", len(rig.stage[motion]))
-    return np.stack([np.stack([points_m.min(0), points_m.max(0)]) for points_m in surfaces_m])
+    return np.stack([box(points_m) for points_m in surfaces_m])

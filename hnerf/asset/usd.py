@@ -13,7 +13,7 @@ from hnerf.asset.quads import polygon_corners
 from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.srgb import to_linear
-from hnerf.asset.staging import REST_POSE, StagedAvatar, moved_points, shape_names
+from hnerf.asset.staging import REST_POSE, StagedAvatar, box, moved_points, shape_names
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
 from hnerf.geometry.camera import Camera
 
@@ -265,7 +265,7 @@ def vec3f(values: np.ndarray) -> Vt.Vec3fArray:
 
 def extent(points_m: np.ndarray) -> Vt.Vec3fArray:
     """Return the box around points (n, 3) as USD's array of two corners."""
-    return vec3f(np.stack([points_m.min(0), points_m.max(0)]))
+    return vec3f(box(points_m))
 
 
 def _matrices(transforms: np.ndarray) -> Vt.Matrix4dArray:

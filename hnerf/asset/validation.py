@@ -11,6 +11,7 @@ from pxr import Usd, UsdGeom, UsdSkel, UsdValidation, UsdVol
 from hnerf.asset.package_checks import package_defects
 from hnerf.asset.rig_checks import animation_defects, samples, skeleton_defects, skin_defects
 from hnerf.asset.splat_checks import splat_defects
+from hnerf.asset.staging import box
 from hnerf.errors import InvalidAsset
 
 PLAUSIBLE_SIZE_M = (0.4, 3.0)  # longest side of the box around a person at rest; capture.toml takes 0.5 m to 2.5 m
@@ -108,7 +109,7 @@ def _mesh_defects(mesh: UsdGeom.Mesh) -> list[str]:
             continue
         if indices.min() < 0 or indices.max() >= len(points):
             defects.append(f"{name}: face index out of range at time {time}")
-        lower, upper = points.min(0), points.max(0)
+        lower, upper = box(points)
         if time.IsDefault() and not PLAUSIBLE_SIZE_M[0] <= (upper - lower).max() <= PLAUSIBLE_SIZE_M[1]:
             defects.append(f"{name}: {(upper - lower).max():.3g} m is not a person's size")
         extent = np.array(mesh.GetExtentAttr().Get(time))

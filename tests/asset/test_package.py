@@ -11,7 +11,7 @@ from pxr import Ar, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.correctives import correctives_of
 from hnerf.asset.dome import dome
-from hnerf.asset.package import write_usdz
+from hnerf.asset.package import _everywhere, write_usdz
 from hnerf.asset.quads import polygon_corners
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import StagedAvatar, stage_avatar
@@ -308,6 +308,13 @@ def test_the_extents_hint_contains_every_motion(staged: StagedAvatar, tmp_path: 
     hint = np.array(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get())
     corners = np.concatenate([boxes.reshape(-1, 3) for boxes in far.extents_m.values()])
     assert (hint[1] >= corners.max(0) - 1e-4).all() and (hint[0] <= corners.min(0) + 1e-4).all()
+
+
+def test_the_extents_hint_is_made_from_boxes(staged: StagedAvatar) -> None:
+    """Boxes of 4, 12 and 16 poses at 10, 24 and 30 frames a second, and of the rest, the cache and the physique."""
+    corners_m = _everywhere(staged)
+    assert len(corners_m) == 2 * (4 + 12 + 16 + 3)
+    assert (corners_m.min(0) <= staged.points_m.min((0, 1))).all()
 
 
 def bound_surface(stage: Usd.Stage) -> UsdShade.Shader:
