@@ -101,7 +101,8 @@ def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: f
 def write_usdz(path: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar.usdz`: the same prims and variants as the package in a single layer, and the texture."""
     with tempfile.TemporaryDirectory() as folder:
-        stage = _new_stage(Path(folder) / "avatar.usdc", avatars, _time_range(avatars, CAPTURED, fps), fps, info)
+        layer = Path(folder) / "avatar.usdc"
+        stage = _new_stage(layer, path.name, avatars, _time_range(avatars, CAPTURED, fps), fps, info)
         for part in _parts(avatars, list(cameras), fps):
             with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
                 part.author(stage)
@@ -112,7 +113,8 @@ def write_usdz(path: Path, avatars: Avatars, cameras: Iterable[Camera], fps: flo
 def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar_cache.usdz`: the surface as world-space points at every frame, for programs without skinning."""
     with tempfile.TemporaryDirectory() as folder:
-        stage = _new_stage(Path(folder) / "avatar_cache.usdc", {"": avatar}, avatar.frames, fps, info)
+        layer = Path(folder) / "avatar_cache.usdc"
+        stage = _new_stage(layer, path.name, {"": avatar}, avatar.frames, fps, info)
         author_cameras(stage, cameras, avatar.stage_from_world)
         mesh = define_mesh(stage, ROOT.AppendChild("Surface"), avatar, level=0)
         author_captured_look(stage, [mesh.GetPath()], avatar)
@@ -126,7 +128,7 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
 
 def write_splats(path: Path, avatar: StagedAvatar, splats: Splats, fps: float, info: AssetInfo) -> None:
     """Write `avatar_splats.usdc`: Gaussian splats on the surface at every frame."""
-    stage = _new_stage(path, {"": avatar}, avatar.frames, fps, info)
+    stage = _new_stage(path, path.name, {"": avatar}, avatar.frames, fps, info)
     author_splats(stage, avatar, splats)
     stage.GetRootLayer().Save()
 
@@ -220,7 +222,7 @@ def _select(stage: Usd.Stage, avatars: Avatars, motion: str) -> None:
 def _write_interface(file: Path, parts: list[Part], avatars: Avatars, fps: float, info: AssetInfo, motion: str) -> None:
     """Write an interface layer with a rate of its time codes and with that motion selected. It refers to the payloads
     directly: time codes that are scaled twice are not whole, and importers that hold samples would be a frame late."""
-    stage = _new_stage(file, avatars, _time_range(avatars, motion, fps), fps, info)
+    stage = _new_stage(file, file.name, avatars, _time_range(avatars, motion, fps), fps, info)
     for part in parts:
         path = f"./{PAYLOADS}/{part.name}.usdc"
         with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
@@ -238,8 +240,9 @@ def _time_range(avatars: Avatars, selected: str, fps: float) -> np.ndarray:
     return np.array([first, max([last, *(np.ceil(end - 1e-6) for end in ends)])])
 
 
-def _new_stage(file: Path, avatars: Avatars, codes: np.ndarray, fps: float, info: AssetInfo) -> Usd.Stage:
-    """Return a stage from the first to the last of time codes, with the root prim and its metadata."""
+def _new_stage(file: Path, name: str, avatars: Avatars, codes: np.ndarray, fps: float, info: AssetInfo) -> Usd.Stage:
+    """Return a stage from the first to the last of time codes, with the root prim and its metadata. name: of the file
+    that the user opens, in which `file` may be packed."""
     stage = Usd.Stage.CreateNew(str(file))
     _set_units(stage, fps)
     stage.SetStartTimeCode(float(codes[0]))
@@ -249,7 +252,7 @@ def _new_stage(file: Path, avatars: Avatars, codes: np.ndarray, fps: float, info
     model = Usd.ModelAPI(root)
     model.SetKind(Kind.Tokens.component)
     model.SetAssetName(info.name)
-    model.SetAssetIdentifier(Sdf.AssetPath(f"./{INTERFACE}"))
+    model.SetAssetIdentifier(Sdf.AssetPath(f"./{name}"))
     model.SetAssetVersion(info.version)
     for key, value in (("captureDigest", info.capture), ("licence", info.licence)):
         root.SetAssetInfoByKey(key, value)

@@ -275,12 +275,12 @@ def test_packing_an_avatar_again_later_gives_identical_bytes_and_no_output(
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
-@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda", "avatar_cache.usdz"])
 def test_the_root_prim_says_what_the_asset_is(name: str, package: Path) -> None:
     stage = Usd.Stage.Open(str(package / name))
     root, model = stage.GetDefaultPrim(), Usd.ModelAPI(stage.GetDefaultPrim())
     assert (model.GetKind(), model.GetAssetName(), model.GetAssetVersion()) == ("component", "column", "7")
-    assert model.GetAssetIdentifier().path == "./avatar.usda"
+    assert model.GetAssetIdentifier().path == f"./{name}"
     assert (root.GetAssetInfoByKey("captureDigest"), root.GetAssetInfoByKey("licence")) == ("0123abcd", "CC0-1.0")
 
 
