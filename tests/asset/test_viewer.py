@@ -234,6 +234,23 @@ def test_the_person_is_framed_from_the_front(page: Page, staged: StagedAvatar) -
 
 
 @NEEDS_THREE
+def test_a_hidden_page_frames_the_person_when_it_is_shown(page: Page) -> None:
+    camera = "viewer.stage.free.position.toArray()"
+    page.evaluate("viewer.stage.frame(viewer.bounds)")
+    framed = page.evaluate(camera)
+    page.evaluate("viewer.stage.free.position.set(1, 2, 3)")
+    page.evaluate("document.getElementById('view').hidden = true")
+    page.wait("viewer.stage.canvas.clientWidth === 0")
+    page.evaluate("new Promise(requestAnimationFrame)")  # so that the page notices
+    page.evaluate("viewer.stage.frame(viewer.bounds)")
+    assert page.evaluate("viewer.stage.free.projectionMatrix.elements.every(Number.isFinite)")
+    assert page.evaluate(camera) == [1, 2, 3]
+    page.evaluate("document.getElementById('view').hidden = false")
+    page.wait(f"{camera}[0] !== 1")
+    assert page.evaluate(camera) == pytest.approx(framed)
+
+
+@NEEDS_THREE
 def test_the_rest_pose_moves_no_vertices(page: Page, staged: StagedAvatar) -> None:
     page.evaluate("viewer.setTime(0.2)")
     page.evaluate("viewer.setMotion(viewer.avatar.motions.length)")

@@ -58,8 +58,12 @@ export class Stage {
     this.grid.add(new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ vertexColors: true, transparent: true })));
   }
 
-  // Puts the free camera before the person, a little to the side, so that the box fills the picture.
-  frame({ box, ground, forward }) {
+  // Puts the free camera before the person, a little to the side, so that the box fills the picture; while the canvas
+  // is hidden, as soon as it is shown.
+  frame(bounds) {
+    this.framedLater = this.canvas.clientWidth * this.canvas.clientHeight ? null : bounds;
+    if (this.framedLater) return;
+    const { box, ground, forward } = bounds;
     const size = box.getSize(new THREE.Vector3());
     const tangent = Math.tan(THREE.MathUtils.degToRad(FIELD_OF_VIEW_DEG / 2));
     const width = Math.hypot(size.x, size.z);
@@ -104,11 +108,13 @@ export class Stage {
 
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (!(width * height)) return;
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     this.free.aspect = width / height;
     this.free.updateProjectionMatrix();
     if (this.recorded) this.project(this.recorded, width, height);
+    if (this.framedLater) this.frame(this.framedLater);
   }
 
   // Projects so that the photograph, as large as fits into the middle of the canvas, matches pixel by pixel. Pixel
