@@ -251,6 +251,14 @@ def test_a_hidden_page_frames_the_person_when_it_is_shown(page: Page) -> None:
 
 
 @NEEDS_THREE
+def test_another_ground_replaces_the_old_one(page: Page) -> None:
+    geometries = "(viewer.stage.render(), viewer.stage.renderer.info.memory.geometries)"
+    before = page.evaluate(geometries)
+    page.evaluate("viewer.stage.drawGround()")
+    assert page.evaluate(geometries) == before
+
+
+@NEEDS_THREE
 def test_the_rest_pose_moves_no_vertices(page: Page, staged: StagedAvatar) -> None:
     page.evaluate("viewer.setTime(0.2)")
     page.evaluate("viewer.setMotion(viewer.avatar.motions.length)")

@@ -54,6 +54,7 @@ export class Stage {
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
     geometry.setAttribute("color", new THREE.Float32BufferAttribute(colours, 4));
+    for (const old of this.grid.children) [old.geometry, old.material].forEach((part) => part.dispose());
     this.grid.clear();
     this.grid.add(new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ vertexColors: true, transparent: true })));
   }
