@@ -16,6 +16,7 @@ from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
+from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
 
 CAPTURED = "captured"  # the motion at the capture's own rate, whose time codes are the capture's frames
@@ -177,6 +178,15 @@ def moved_points(offsets_m: np.ndarray) -> np.ndarray:
 def stage_from_world(up: str) -> np.ndarray:
     """Return the rotation (3, 3) from world axes to Y up."""
     return {"z": Y_UP_FROM_Z_UP, "y": np.eye(3)}[up]
+
+
+def opengl_pose(camera: Camera, stage_from_world: np.ndarray) -> np.ndarray:
+    """Return a camera's transform in the stage (4, 4), with the axes of OpenGL, USD and glTF: x right, y up, looking
+    along -z."""
+    pose = np.eye(4)
+    pose[:3, :3] = stage_from_world @ camera.R.T @ np.diag([1, -1, -1])
+    pose[:3, 3] = stage_from_world @ camera.centre_m
+    return pose
 
 
 def _motions(

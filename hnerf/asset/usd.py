@@ -13,7 +13,7 @@ from hnerf.asset.quads import polygon_corners
 from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.srgb import to_linear
-from hnerf.asset.staging import REST_POSE, StagedAvatar, box, moved_points, shape_names
+from hnerf.asset.staging import REST_POSE, StagedAvatar, box, moved_points, opengl_pose, shape_names
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
 from hnerf.geometry.camera import Camera
 
@@ -223,10 +223,7 @@ def define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, stage_from_w
     prim.CreateHorizontalApertureOffsetAttr(APERTURE * (0.5 - (cx + 0.5) / camera.width_px))
     prim.CreateVerticalApertureOffsetAttr(vertical_aperture * ((cy + 0.5) / camera.height_px - 0.5))
     prim.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000))
-    pose = np.eye(4)
-    pose[:3, :3] = stage_from_world @ camera.R.T @ np.diag([1, -1, -1])
-    pose[:3, 3] = stage_from_world @ camera.centre_m
-    prim.AddTransformOp().Set(Gf.Matrix4d(pose.T))
+    prim.AddTransformOp().Set(Gf.Matrix4d(opengl_pose(camera, stage_from_world).T))
     return prim
 
 

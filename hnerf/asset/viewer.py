@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hnerf.asset.compact_glb import compact_glb
+from hnerf.asset.staging import opengl_pose
 from hnerf.capture.capture import Capture
 from hnerf.errors import InputError
 from hnerf.evaluation.pictures import data_uri, shrunk
@@ -73,8 +74,7 @@ def recording(capture: Capture, stage_from_world: np.ndarray) -> dict[str, Any]:
     """Return the data of the capture that the page shows: its time, and training cameras with photographs of training
     frames.
 
-    Instants are seconds from the first frame. `pose`: the camera's transform in the avatar's world, row by row, with
-    the axes of OpenGL (x right, y up, looking along -z).
+    Instants are seconds from the first frame. `pose`: that of `opengl_pose`, row by row.
     """
     names = evenly_spaced(capture.train_cameras, CAMERAS)
     frames = evenly_spaced(capture.train_frames, PHOTOGRAPHS)
@@ -90,9 +90,7 @@ def recording(capture: Capture, stage_from_world: np.ndarray) -> dict[str, Any]:
 
 
 def _camera(camera: Camera, stage_from_world: np.ndarray) -> dict[str, Any]:
-    pose = np.eye(4)
-    pose[:3, :3] = stage_from_world @ camera.R.T @ np.diag([1, -1, -1])
-    pose[:3, 3] = stage_from_world @ camera.centre_m
+    pose = opengl_pose(camera, stage_from_world)
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     size = {"width": camera.width_px, "height": camera.height_px}
     return {"name": camera.name, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, "pose": pose.ravel().tolist()}
