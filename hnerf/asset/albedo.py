@@ -3,9 +3,11 @@
 import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from hnerf.asset.dome import dome
 from hnerf.asset.light import Light
 from hnerf.asset.photographs import FIELD_WEIGHT, BackProjection, SeenTexels
 from hnerf.asset.srgb import to_linear, to_srgb
@@ -20,6 +22,11 @@ class Albedo:
 
     texture: np.ndarray
     light: Light
+
+    @cached_property
+    def dome(self) -> tuple[np.ndarray, float]:
+        """Return the light as an image and its intensity, as `hnerf.asset.dome.dome` does."""
+        return dome(self.light)
 
 
 class AlbedoBlend:

@@ -22,7 +22,6 @@ from zipfile import ZipFile
 import numpy as np
 from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
-from hnerf.asset.dome import dome
 from hnerf.asset.rigs import FULL
 from hnerf.asset.splat_prim import author_splats
 from hnerf.asset.splats import Splats
@@ -188,7 +187,7 @@ def _looks(avatar: StagedAvatar, fps: float, prefix: str) -> list[Part]:
     author = partial(author_captured_look, meshes=meshes, avatar=avatar, prefix=prefix)
     looks = [Part("look_captured", author, fps, ("look", "captured"))]
     if avatar.albedo is not None:
-        _, intensity = dome(avatar.albedo.light)
+        _, intensity = avatar.albedo.dome
         author = partial(author_albedo_look, meshes=meshes, avatar=avatar, intensity=intensity, prefix=prefix)
         looks.append(Part("look_albedo", author, fps, ("look", "albedo")))
     return looks
@@ -289,7 +288,7 @@ def _write_images(folder: Path, avatars: Avatars) -> None:
         write_image(folder / f"{prefix}{TEXTURE_NAME}", avatar.texture)
         if avatar.albedo is not None:
             write_image(folder / f"{prefix}{ALBEDO_NAME}", avatar.albedo.texture)
-            write_image(folder / f"{prefix}{LIGHT_NAME}", dome(avatar.albedo.light)[0])
+            write_image(folder / f"{prefix}{LIGHT_NAME}", avatar.albedo.dome[0])
         if avatar.normal_map is not None:
             write_image(folder / f"{prefix}{NORMAL_MAP_NAME}", avatar.normal_map)
 

@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 
 from hnerf.asset.comparison import Compared
-from hnerf.asset.dome import dome
 from hnerf.asset.extreme_poses import ExtremePose
 from hnerf.asset.pictures import texture_picture, textured, turntable_cameras, uv_picture, wireframe
 from hnerf.asset.skeleton import FRONT
@@ -98,7 +97,7 @@ def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:
     """Return the albedo and the light, if there are any."""
     if avatar.albedo is None:
         return []
-    light = cv2.resize(dome(avatar.albedo.light)[0], (SQUARE_PX, SQUARE_PX // 2))
+    light = cv2.resize(avatar.albedo.dome[0], (SQUARE_PX, SQUARE_PX // 2))
     return [
         _picture("Albedo", texture_picture(avatar.albedo.texture, SQUARE_PX)),
         _picture("Estimated light, +Z in the middle, +X left of it", light),
