@@ -56,7 +56,10 @@ class AssetMesh:
         rest_m, skin = self.rig.vertices_m.numpy(), self.rig.faces.numpy()[: self.skin_faces]
         share = np.ones((len(rest_m), 1), np.float32)
         for _ in range(HALVINGS):
-            share[np.unique(skin[crossing_faces(rest_m + share * offsets_m, skin)])] /= 2
+            crossing = crossing_faces(rest_m + share * offsets_m, skin)
+            if not crossing.any():
+                break
+            share[np.unique(skin[crossing])] /= 2
         vertices_m = torch.from_numpy(rest_m + share * offsets_m)
         return dataclasses.replace(self, rig=with_vertices(self.rig, vertices_m))
 
