@@ -298,7 +298,7 @@ class AssetSettings(Section):
     level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # most triangles of each lower level of detail
     texture_px: int = Field(default=1024, ge=16, le=8192)  # side of the texture
     texture_poses: int = Field(default=3, ge=1)  # poses whose median gives the field's colour of a texel
-    photograph_frames: int = Field(default=16, ge=0)  # frames whose photographs make the texture; 0: the field alone
+    photograph_frames: int = Field(default=16, ge=0)  # most frames photographed for the texture; 0: the field alone
     normal_map_px: int = Field(default=0, ge=0, le=8192)  # side of the normal map; 0: none, since it shows grid cells
     correctives: int = Field(default=16, ge=0, le=64)  # blend shapes for what skinning leaves out; 0: none
     bones: Literal["along", "identity"] = "along"  # joint axes at rest: Y along the bone, or the stage's

@@ -18,6 +18,7 @@ from hnerf.render.motion import select_poses
 from hnerf.side_by_side import side_by_side
 
 FIELD_PX = 512  # side of the field's texture that photographs are blended with; the field has less detail than they
+MOST_TEXELS = 1 << 29  # of all photographs together: what they show is kept, about 4 bytes each
 CAVITY_BRIGHTNESS = 0.3  # factor of sRGB values
 
 
@@ -43,7 +44,7 @@ def baked_textures(
         field = field_colours(avatar, posed, texels, cavities)
         return texture_image(texels, field * lit, settings.texture_px), None
     field = _coarse_field_colours(avatar, posed, layout, texels, settings.texture_px, cavities)
-    frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
+    frames = photographed_frames(capture, settings)
     photographed = {frame: SeenSurface.of(surfaces_m[clothed.index(frame)], faces) for frame in frames}
     light = fit_light(photographed_shading(capture, avatar.gains, photographed))
     seen_by_field = [surfaces_m[clothed.index(frame)] for frame in posed.frames]
@@ -59,6 +60,13 @@ def baked_textures(
     blends: list[CapturedBlend | AlbedoBlend] = [captured, albedo]
     texture, delit = side_by_side(finished, blends)
     return texture, Albedo(delit, light)
+
+
+def photographed_frames(capture: Capture, settings: AssetSettings) -> list[int]:
+    """Return the training frames whose photographs make the texture: fewer than the settings ask for if cameras are so
+    many, or the texture so large, that they would take gigabytes."""
+    affordable = MOST_TEXELS // (settings.texture_px**2 * len(capture.train_cameras))
+    return evenly_spaced(capture.train_frames, min(settings.photograph_frames, max(1, affordable)))
 
 
 def _coarse_field_colours(

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.asset.baking import CAVITY_BRIGHTNESS, baked_textures
+from hnerf.asset.baking import CAVITY_BRIGHTNESS, baked_textures, photographed_frames
 from hnerf.asset.light import Light
 from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.texture import rasterise, unwrap
@@ -102,3 +102,15 @@ def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
         ratio = shown[1] / shown[0]
         assert np.median(ratio[z_m.min(1) > 0.85]) == pytest.approx(CAVITY_BRIGHTNESS, abs=0.05)
         np.testing.assert_allclose(ratio[z_m.max(1) < 0.6], 1, atol=0.02)
+
+
+def test_many_cameras_or_a_large_texture_take_fewer_frames() -> None:
+    """With 64 cameras, 2^29 texels are 8 photographs each of 1024 px, and half of one of 4096 px."""
+    capture = dataclasses.replace(
+        figure.capture(), train_cameras=tuple(f"{k}" for k in range(64)), train_frames=tuple(range(100))
+    )
+    counts = [
+        len(photographed_frames(capture, AssetSettings(texture_px=side_px, photograph_frames=16)))
+        for side_px in (512, 1024, 4096)
+    ]
+    assert counts == [16, 8, 1]
