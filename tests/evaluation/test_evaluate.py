@@ -373,6 +373,7 @@ def test_the_report_shows_scores_findings_and_charts(scored: Scored) -> None:
     base, found = scored
     text = (base / "subject" / "evaluation" / "report.html").read_text()
     assert f"{found['novel_view']['psnr']:.2f}" in text
+    assert ">3 images, 1 surface<" in text
     assert '<span class="status rejected">' in text and "9.25" in text
     assert "a processor" in text and "12.5" in text
     assert 'alt="Losses"' in text and 'alt="Held-out quality"' in text
