@@ -7,6 +7,7 @@ from torch import Tensor
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.canonical import Descriptor, PosedBodies
+from hnerf.body.limbs import CLOSE_M
 from hnerf.body.rig import Rig
 from tests.body.boxes import box_faces, box_rig, box_vertices, hinged
 from tests.body.reference import closest_points_reference, on_surface
@@ -76,6 +77,7 @@ def test_only_limbs_that_moved_closer_than_at_rest_are_close() -> None:
     assert not close[torch.arange(len(own)), own].any() and not close[:, 2:].any()
     rig = limbs_rig(0.04)
     assert not rig.limbs.close(rig.vertices_m[None]).any()
+    assert CLOSE_M == 0.06
 
 
 def test_a_point_between_two_limbs_is_described_by_both() -> None:

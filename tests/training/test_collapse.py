@@ -1,21 +1,27 @@
 """Collapse: a surface that is empty or fills the box ends training with an error, at the real thresholds."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hnerf.fields import fast
 from hnerf.fields.base import Field
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
+from hnerf.fields.samples import RaySamples
 from hnerf.training import fixed_rays
+from hnerf.training.fixed_rays import FixedRays
+from hnerf.training.pixels import PixelRays
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer
 from tests.training.scene import ALONE, record, tiny
+
+Relabelled = Callable[[PixelRays, RaySamples], tuple[Tensor, Tensor]]  # which rays are at edges, which show the person
 
 FAR = 10.0  # units of the residual's last layer: metres away in either field
 
@@ -70,54 +76,56 @@ def test_a_collapsed_surface_is_an_error(tmp_path: Path, kind: str, outwards: fl
         trainer.run()
 
 
-def test_a_single_pixel_away_from_outlines_does_not_decide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The mask may be wrong there. Here one pixel is labelled as outside the person, and all others as outline."""
-    trainer = trainer_of(tmp_path, "fast")
+def require_surface_if(relabelled: Relabelled, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Check the surface of an untrained `fast` field, which is the body's, on rays with other labels."""
+    trainer = trainer_of(folder, "fast")
     sample = trainer.fixed_rays.sample
 
-    def with_one_clear(*given: Any) -> Any:
+    def sample_relabelled(_: FixedRays, *given: Any) -> tuple[PixelRays, RaySamples]:
         rays, samples = sample(*given)
+        edge, person = relabelled(rays, samples)
+        return dataclasses.replace(rays, edge=edge, person=person), samples
+
+    monkeypatch.setattr(FixedRays, "sample", sample_relabelled)
+    trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
+
+
+def test_a_single_pixel_away_from_outlines_does_not_decide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The mask may be wrong there. Here one pixel is labelled as outside the person, and all others as outline."""
+
+    def with_one_clear(rays: PixelRays, _: RaySamples) -> tuple[Tensor, Tensor]:
         (shown,) = torch.nonzero(rays.person)[:1, 0]
         edge, person = torch.ones_like(rays.edge), rays.person.clone()
         edge[shown], person[shown] = False, False
-        return dataclasses.replace(rays, edge=edge, person=person), samples
+        return edge, person
 
-    monkeypatch.setattr(fixed_rays.FixedRays, "sample", lambda _, *given: with_one_clear(*given))
-    trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
+    require_surface_if(with_one_clear, tmp_path, monkeypatch)
 
 
 def test_holes_in_masks_are_not_taken_for_surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Every second pixel of the person is labelled as background away from outlines, and the background as outline."""
     monkeypatch.setattr(fixed_rays, "RAYS", 512)
-    trainer = trainer_of(tmp_path, "fast")
-    sample = trainer.fixed_rays.sample
 
-    def with_holes(*given: Any) -> Any:
-        rays, samples = sample(*given)
+    def with_holes(rays: PixelRays, _: RaySamples) -> tuple[Tensor, Tensor]:
         holes, edge, person = torch.nonzero(rays.person)[::2, 0], ~rays.person, rays.person.clone()
         edge[holes], person[holes] = False, False
-        return dataclasses.replace(rays, edge=edge, person=person), samples
+        return edge, person
 
-    monkeypatch.setattr(fixed_rays.FixedRays, "sample", lambda _, *given: with_holes(*given))
-    trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
+    require_surface_if(with_holes, tmp_path, monkeypatch)
 
 
 def test_a_surface_that_covers_outlines_alone_does_not_fill_the_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Every second pixel of the person is labelled as outline, and only five pixels beside it as background."""
     monkeypatch.setattr(fixed_rays, "RAYS", 512)
-    trainer = trainer_of(tmp_path, "fast")
-    sample = trainer.fixed_rays.sample
 
-    def with_wide_outlines(*given: Any) -> Any:
-        rays, samples = sample(*given)
+    def with_wide_outlines(rays: PixelRays, samples: RaySamples) -> tuple[Tensor, Tensor]:
         outline = torch.nonzero(rays.person)[::2, 0]
         beside = torch.nonzero(~rays.person & (samples.in_box > 0).any(1))[:, 0]
         edge, person = torch.zeros_like(rays.edge), rays.person.clone()
         edge[outline], person[outline], person[beside[5:]] = True, False, True
-        return dataclasses.replace(rays, edge=edge, person=person), samples
+        return edge, person
 
-    monkeypatch.setattr(fixed_rays.FixedRays, "sample", lambda _, *given: with_wide_outlines(*given))
-    trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
+    require_surface_if(with_wide_outlines, tmp_path, monkeypatch)
 
 
 def test_a_nan_distance_counts_as_an_empty_surface(tmp_path: Path):
