@@ -99,7 +99,8 @@ class BoardDetector:
 @dataclass(frozen=True)
 class BoardFootage:
     """Corners in the footage of a board. corners_px: per camera (frames, N, 2) as recorded, NaN where not seen, in the
-    order of `frames`, which are every `frame_step`-th of the footage."""
+    order of `frames`, which are every `frame_step`-th of the footage; if it is intrinsic, in every n-th of the camera's
+    own frames."""
 
     path: Path
     board: Board
@@ -185,8 +186,8 @@ def read_board_footage(
 
     In long footage only every n-th frame is examined, including frame `wanted` if it is given. In extrinsic footage,
     images with the same frame number are assumed to be simultaneous in all cameras; videos are numbered by Caliscope's
-    `timestamps.csv` if there is one. Raises InputError on files that cannot be read or do not match, or if there is no
-    frame `wanted`.
+    `timestamps.csv` if there is one. Intrinsic footage shows one camera at a time, so that n differs between cameras.
+    Raises InputError on files that cannot be read or do not match, or if there is no frame `wanted`.
     """
     path = safe_io.path_in_capture(folder, "calibration", part)
     footage, board = _footage(folder, part), read_board(folder)
@@ -202,9 +203,10 @@ def read_board_footage(
     frames = frames[0 if wanted is None else frames.index(wanted) % step :: step]
     corners_px, sizes_px = {}, {}
     for name, pictures in footage.items():
-        corners_px[name], sizes_px[name] = _corners(board, pictures, numbers[name], frames)
+        own = frames if part == "extrinsic" else numbers[name][:: math.ceil(len(numbers[name]) / MAX_FRAMES)]
+        corners_px[name], sizes_px[name] = _corners(board, pictures, numbers[name], own)
         shown = int(np.isfinite(corners_px[name][..., 0]).any(-1).sum())
-        log.info("%s: board found in %d of %d frames", pictures.path, shown, len(frames))
+        log.info("%s: board found in %d of %d frames", pictures.path, shown, len(own))
     return BoardFootage(path, board, frames, step, corners_px, sizes_px)
 
 

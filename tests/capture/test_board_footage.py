@@ -210,6 +210,19 @@ def test_long_footage_is_sampled_evenly(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(Video.open(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4").frames) == 10
 
 
+def test_long_close_footage_of_one_camera_leaves_the_frames_of_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hnerf.capture.board_footage.MAX_FRAMES", 4)
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    rec.write_video(tmp_path / "calibration" / "intrinsic" / "cam_0.mp4", 10)
+    for number in (1, 2, 4, 5):
+        write_image(tmp_path / "calibration" / "intrinsic" / "cam_1" / f"{number}.png", charuco_picture(True))
+    footage = read_board_footage(tmp_path, "intrinsic")
+    assert footage is not None and len(footage.corners_px["cam_0"]) == 4
+    assert np.isfinite(footage.corners_px["cam_1"]).all() and len(footage.corners_px["cam_1"]) == 4
+
+
 def test_ingested_board_corners_are_in_pixels_of_the_shrunk_images(tmp_path: Path) -> None:
     """At half the size, x becomes x / 2 - 1 / 4."""
     folder = rec.write_easymocap(tmp_path / "ada")
