@@ -14,7 +14,7 @@ from tasks.store import Artifact
 EDGE_MOVEMENT = "moved_px"
 
 
-@stage("segmentation", version="13")
+@stage("segmentation", version="14")
 def segment(
     out: Path,
     recording: Artifact,

@@ -53,13 +53,19 @@ def encode(mask: np.ndarray) -> bytes:
 
 
 def movement_px(before: Masks, after: Masks) -> float:
-    """Return the mean, over the views that both have, of the mean distance from the edges after to the edges before."""
-    moved = [_edge_distance_px(before.get(*view), after.get(*view)) for view in after.encoded if view in before]
+    """Return the mean, over the views in which both have an edge, of the mean distance from the edges after to the
+    edges before; infinity without such a view. A mask that fills the image has no edge."""
+    pairs = ((_edge(before.get(*view)), _edge(after.get(*view))) for view in after.encoded if view in before)
+    moved = [_edge_distance_px(*pair) for pair in pairs if pair[0].any() and pair[1].any()]
     return float(np.mean(moved)) if moved else float("inf")
 
 
+def _edge(mask: np.ndarray) -> np.ndarray:
+    """Return the outermost pixels of a mask (H, W) bool, without those that only the image's border cuts off."""
+    return mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+
+
 def _edge_distance_px(before: np.ndarray, after: np.ndarray) -> float:
-    """Return the mean distance in pixels from the edge of mask `after`, (H, W) bool, to that of mask `before`."""
-    edges = [m & ~cv2.erode(m.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool) for m in (before, after)]
-    away_px = cv2.distanceTransform((~edges[0]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return float(away_px[edges[1]].mean())
+    """Return the mean distance in pixels from the pixels `after`, (H, W) bool, to the nearest of `before`."""
+    away_px = cv2.distanceTransform((~before).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return float(away_px[after].mean())

@@ -126,6 +126,9 @@ def test_movement_by_hand() -> None:
     masks, moved = (Masks({("a", 0): encode(half(first))}, {}) for first in (10, 13))
     assert movement_px(masks, moved) == pytest.approx(3.0)
     assert movement_px(masks, Masks({("a", 1): encode(half(3))}, {})) == np.inf  # no view in common
+    for full in ({("a", 1): encode(half(10))}, {("a", 1): encode(half(0))}):  # no edge, before or after
+        others = {("a", 1): encode(half(0))}
+        assert movement_px(Masks(masks.encoded | others, {}), Masks(moved.encoded | full, {})) == pytest.approx(3.0)
 
 
 def test_components_of_another_person_are_removed() -> None:
