@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from hnerf.capture.keypoint_sets import COUNTS, KNOWN
-from hnerf.capture.safe_io import read_json
+from hnerf.capture.safe_io import MAX_TEXT_BYTES, read_json
 from hnerf.errors import InputError
 
 MAX_PEOPLE = 64  # in one image
+FRAME_BYTES = 32_000  # in a list of results: four people of 136 points with all digits
 MAX_PX = 1e6  # of a coordinate; far larger ones overflow in later arithmetic
 
 
@@ -44,7 +45,7 @@ def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
     frames = tuple(frames)
     try:
         people: dict[int, list[Any]] = {}
-        results = read_json(path)
+        results = read_json(path, MAX_TEXT_BYTES + FRAME_BYTES * len(frames))
         if len(results) > MAX_PEOPLE * len(frames):
             raise InputError(
                 f"{path}: {len(results)} people in {len(frames)} images; keep at most {MAX_PEOPLE} in each"

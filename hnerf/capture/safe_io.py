@@ -185,10 +185,10 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     return text
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> Any:
     """Read a JSON file. Raises InputError as `read_text` does, or if it is not JSON."""
     try:
-        return json.loads(read_text(path))
+        return json.loads(read_text(path, max_bytes))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON ({error}); export it again") from None
 

@@ -151,6 +151,15 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
             read_results(tmp_path / "01.json", (0, 1, 3))
 
 
+def test_lists_of_results_may_grow_with_the_recording(tmp_path: Path) -> None:
+    """A minute of 136 points, at 60 frames a second, has 28 MB."""
+    result = {"image_id": 2, "keypoints": points(17).ravel().tolist()}
+    (tmp_path / "01.json").write_text(json.dumps([result]) + 28_000_000 * " ")
+    assert len(read_results(tmp_path / "01.json", range(3600))[2]) == 1
+    with pytest.raises(InputError, match=r"01\.json: 28\d* bytes are too many"):
+        read_results(tmp_path / "01.json", range(36))
+
+
 def test_lists_of_results_next_to_the_images_are_ingested(tmp_path: Path) -> None:
     folder = rec.write_easymocap(tmp_path / "person")
     for path in folder.glob("openpose/*/*.json"):
