@@ -18,7 +18,7 @@ from hnerf.capture.bars import Area
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.lens import checked_lens
-from hnerf.capture.safe_io import check_image_size
+from hnerf.capture.safe_io import IMAGE_SUFFIXES, check_image_size
 from hnerf.capture.timing import median_step, nearest_frame, resample
 from hnerf.errors import InputError, raise_if_unreachable
 from hnerf.geometry.camera import Camera
@@ -78,11 +78,12 @@ class Capture:
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """Read the image recorded nearest in time to a frame, (H, W, 3) uint8 RGB. Raises InputError without one."""
-        folder, stem = self.root / "images" / camera, f"{self.recorded_frame(camera, frame):06d}"
-        found = sorted(folder.glob(f"{stem}.*"))
-        if not found:
-            raise InputError(f"{folder}/{stem}.*: image missing; every camera needs every frame")
-        return read_rgb(found[0])
+        stem = self.root / "images" / camera / f"{self.recorded_frame(camera, frame):06d}"
+        paths = (stem.with_suffix(suffix) for suffix in IMAGE_SUFFIXES)  # a search of the folder slows down as it grows
+        found = next((path for path in paths if path.exists()), None)
+        if found is None:
+            raise InputError(f"{stem}.*: image missing; every camera needs every frame")
+        return read_rgb(found)
 
     def background(self, camera: str) -> np.ndarray | None:
         """Read the clean plate, (H, W, 3) uint8 RGB; None if the recording has none."""
