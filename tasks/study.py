@@ -23,7 +23,7 @@ from tasks.training import load_trained_avatar
 EXTREME_POSES = 3  # checked for each strength and seed
 
 
-@stage("study-capture", version="5")
+@stage("study-capture", version="6")
 def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) -> dict[str, float]:
     """Write a degraded capture in the format that `ingest` writes."""
     degradation.apply(Capture.load(recording.root), out=out)

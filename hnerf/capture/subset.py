@@ -47,7 +47,7 @@ def subset(
         train_frames=select(capture, "training frame", train_frames, capture.train_frames),
         novel_pose_frames=select(capture, "novel-pose frame", novel_pose_frames, capture.novel_pose_frames),
     )
-    kept = dataclasses.replace(kept, subject_point=_subject_point(capture, kept))
+    kept = dataclasses.replace(kept, subject_point=subject_point(capture, kept))
     if not kept.train_cameras or not kept.train_frames:
         raise InputError(f"{capture.name}: no training camera or frame would be left; keep one of each")
     write_arrays(capture, kept)
@@ -57,15 +57,15 @@ def subset(
     kept.save()
 
 
-def _subject_point(capture: Capture, kept: Capture) -> SubjectPoint | None:
-    """Return the point that names the subject; if its camera or frame is left out, a keypoint of the subject in
-    another."""
+def subject_point(capture: Capture, kept: Capture, change: PointChange | None = None) -> SubjectPoint | None:
+    """Return the point that names the subject; if its camera or frame is left out, or points change as in
+    `write_arrays`, a keypoint of the subject in the kept capture."""
     point = capture.subject_point
     if point is None or not point.camera or capture.keypoints(point.camera) is None:
         return point
-    if point.camera in kept.train_cameras and point.frame in kept.frames:
+    if not change and point.camera in kept.train_cameras and point.frame in kept.frames:
         return point
-    found = subject_keypoints(capture)
+    found = {name: change(name, points) if change else points for name, points in subject_keypoints(capture).items()}
     for name, frame in product(kept.train_cameras, kept.frames):
         x, y, confidence = max(found[name][capture.frames.index(frame)].tolist(), key=itemgetter(2))
         if confidence:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import Capture
-from hnerf.capture.subset import copy_pixels, require_several_cameras, subset, write_arrays
+from hnerf.capture.subset import copy_pixels, require_several_cameras, subject_point, subset, write_arrays
 from hnerf.errors import NotApplicableError
 
 T = TypeVar("T")
@@ -43,7 +43,8 @@ def delay_camera(capture: Capture, frames: float, rng: np.random.Generator, out:
     late = str(rng.choice(capture.train_cameras))
     rows = np.maximum(np.arange(len(capture.frames)) - round(frames), 0)
     shown = {late: tuple(capture.frames[row] for row in rows)}
-    kept = dataclasses.replace(capture, root=out)
+    named = subject_point(capture, capture, lambda name, points: points[rows] if name == late else points)
+    kept = dataclasses.replace(capture, root=out, subject_point=named)
     write_arrays(capture, kept, shown=shown)
     for name in capture.cameras:
         copy_pixels(capture, kept, name, shown.get(name))

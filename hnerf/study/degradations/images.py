@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import PERSON, Capture, write_image
-from hnerf.capture.subset import PointChange, copy_pixels, require_several_cameras, write_arrays
+from hnerf.capture.subset import PointChange, copy_pixels, require_several_cameras, subject_point, write_arrays
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
@@ -67,7 +67,7 @@ def rewrite_images(
     (H, W, 3) uint8)`, every given mask and detected person mask by `change_mask(camera, (H, W) uint8 from 0 to 255)`,
     and the points detected in any camera by `change_points(camera, (frames, ..., 3))`. Images are JPEG, as written by
     ingest."""
-    kept = dataclasses.replace(capture, root=out)
+    kept = dataclasses.replace(capture, root=out, subject_point=subject_point(capture, capture, change_points))
     write_arrays(capture, kept, change_points)
     for name in capture.test_cameras:
         copy_pixels(capture, kept, name)

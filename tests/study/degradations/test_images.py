@@ -1,9 +1,11 @@
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hnerf.capture.capture import Capture, write_image
+from hnerf.capture.capture import Capture, SubjectPoint, write_image
+from hnerf.study.degradations.catalogue import Degradation
 from hnerf.study.degradations.images import blur
 from hnerf.study.degradations.occluder import person_middle, pillar
 from tests.study.degradations.test_cameras import degraded
@@ -105,3 +107,25 @@ def test_a_pillar_hides_pixels_masks_and_points_of_the_camera_behind_it(tmp_path
     assert not hands[0, 0, 0].any()  # 7.5 px
     assert hands[0, 0, 1].tolist() == [2, 5, 1]
     assert np.flatnonzero(~likely.any(0)).tolist() == [6, 7, 8, 9]
+
+
+@pytest.mark.parametrize(("kind", "strength"), [("large_images", 2), ("occluder", 1), ("camera_out_of_step", 2)])
+@pytest.mark.parametrize("seed", [0, 1])  # draw different cameras
+def test_a_subject_named_by_a_point_stays_the_subject(tmp_path: Path, kind: str, strength: float, seed: int) -> None:
+    """Of two people who walk in a row, 1.6 m apart, the named one is where the other was two frames ago."""
+    good = write_recording(tmp_path / "good")
+    body_m = np.random.default_rng(0).normal((0, 0, 1), 0.2, (25, 3))
+    walked_m = [
+        [body_m + np.array([0.3 * k, 0.6 * k + behind, 0]) for behind in (0.4, -1.2)] for k in range(len(good.frames))
+    ]
+    seen = {name: camera.project(np.array(walked_m).reshape(-1, 3))[0] for name, camera in good.cameras.items()}
+    people = {name: np.insert(px, 2, 1.0, -1).reshape(-1, 2, 25, 3) for name, px in seen.items()}
+    np.savez(good.root / "keypoints.npz", **people)  # type: ignore[arg-type]
+    named = SubjectPoint(tuple(people["01"][2, 1, 8, :2]), "01", good.frames[2])
+    good = dataclasses.replace(good, subject_point=named)
+    Degradation(kind=kind, strength=strength, seed=seed).apply(good, out=tmp_path / "bad")
+    point = Capture.load(tmp_path / "bad").subject_point
+    assert point is not None
+    shown = Capture.load(tmp_path / "bad").keypoints(point.camera)[good.frames.index(point.frame)]  # type: ignore[index]
+    off_px = np.where(shown[..., 2] > 0, np.linalg.norm(shown[..., :2] - point.at, axis=-1), np.inf).min(1)
+    assert off_px[1] == pytest.approx(0, abs=1e-6) and off_px[0] > 0.1
