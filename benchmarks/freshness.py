@@ -31,10 +31,13 @@ def code_digest(root: Path, result: Result) -> str:
     settings that it reads. Comments, docstrings and formatting do not count."""
     parts = [" ".join(result.command)]
     parts += [f"{path.relative_to(root)}\n{_code(path.read_text())[0]}" for path in sources(root, result)]
-    for pattern in result.configs:
+    patterns = list(result.configs)
+    for pattern in patterns:
         found = sorted((root / "configs").glob(f"{pattern}.yaml"))
         assert found, f"{result.name}: no configs/{pattern}.yaml"
-        parts += [f"{path.relative_to(root)}\n{json.dumps(yaml.safe_load(path.read_text()))}" for path in found]
+        trees = {path: yaml.safe_load(path.read_text()) for path in found}
+        parts += [f"{path.relative_to(root)}\n{json.dumps(tree)}" for path, tree in trees.items()]
+        patterns += [tree["based_on"] for tree in trees.values() if "based_on" in tree]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 

@@ -41,6 +41,14 @@ def test_only_used_code_and_settings_change_the_digest(checkout: Checkout, name:
     assert (code_digest(checkout.root, ONE) != before) is counts
 
 
+def test_the_preset_that_a_preset_is_based_on_changes_the_digest(checkout: Checkout) -> None:
+    checkout.write("configs/mine.yaml", "based_on: fast\n")
+    mine = made("mine", configs=("mine",))
+    before = code_digest(checkout.root, mine)
+    checkout.write("configs/fast.yaml", "steps: 11\n")
+    assert code_digest(checkout.root, mine) != before
+
+
 @pytest.mark.parametrize(
     "text",
     [
