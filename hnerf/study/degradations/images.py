@@ -1,7 +1,7 @@
 """Degradations of the training cameras' images. Test cameras stay the same, so that scores can be compared.
 
 Clean plates are degraded in the same way, since the same camera took them. Detections in the images (keypoints, hands,
-landmarks, person masks) stay, unless pixels move or are hidden.
+landmarks, person masks) stay, unless pixels move or are hidden, and so do those of a board, which was filmed before.
 """
 
 import dataclasses
@@ -11,8 +11,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hnerf.capture.board_footage import BOARDS_FILE
 from hnerf.capture.capture import PERSON, Capture, write_image
-from hnerf.capture.subset import PointChange, copy_pixels, require_several_cameras, subject_point, write_arrays
+from hnerf.capture.subset import (
+    PointChange,
+    copy_files,
+    copy_pixels,
+    require_several_cameras,
+    subject_point,
+    write_arrays,
+)
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
@@ -54,6 +62,7 @@ def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) 
         return np.concatenate([xy, points[..., 2:]], -1) * (points[..., 2:] > 0)  # unseen points stay zero
 
     rewrite_images(capture.with_cameras(cameras), out, resized, resized, scaled)
+    (out / BOARDS_FILE).unlink(missing_ok=True)
 
 
 def rewrite_images(
@@ -83,6 +92,7 @@ def rewrite_images(
         plate = capture.background(name)
         if plate is not None:
             write_image(out / "background" / f"{name}.jpg", change(name, plate))
+    copy_files(capture.root, out, {Path(BOARDS_FILE).stem})
     kept.save()
 
 

@@ -129,3 +129,14 @@ def test_a_subject_named_by_a_point_stays_the_subject(tmp_path: Path, kind: str,
     shown = Capture.load(tmp_path / "bad").keypoints(point.camera)[good.frames.index(point.frame)]  # type: ignore[index]
     off_px = np.where(shown[..., 2] > 0, np.linalg.norm(shown[..., :2] - point.at, axis=-1), np.inf).min(1)
     assert off_px[1] == pytest.approx(0, abs=1e-6) and off_px[0] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("kind", "strength", "kept"),
+    [("image_blur", 1, True), ("camera_out_of_step", 1, True), ("small_images", 0.5, False)],
+)
+def test_board_footage_stays_unless_images_change_size(tmp_path: Path, kind: str, strength: float, kept: bool) -> None:
+    good = write_recording(tmp_path / "good")
+    (good.root / "boards.npz").write_bytes(b"corners")
+    Degradation(kind=kind, strength=strength, seed=0).apply(good, out=tmp_path / "bad")
+    assert (tmp_path / "bad" / "boards.npz").exists() is kept
