@@ -18,7 +18,7 @@ from pathlib import Path
 from provenance import RESULTS, ROOT, SHARED, arguments, clean_commit, provenance, provenance_line
 
 from hnerf.config import SyntheticSettings, overridden
-from hnerf.files import atomic_folder
+from hnerf.files import atomic_folder, markdown_image
 from hnerf.synthetic import write_synthetic_capture
 
 FEW = ["evaluation.max_images=8", "evaluation.max_meshes=2", "evaluation.report_rows=1"]
@@ -50,11 +50,12 @@ def main() -> None:
     kept = RESULTS / options.kind
     kept.mkdir(parents=True, exist_ok=True)
     name = table.stem if options.kind == "ablations" else table.stem.removesuffix("-part")
+    made = table.read_text()
     for path in [*table.parent.glob(f"{table.stem}.*"), *table.parent.glob(f"{table.stem}-*.png")]:
-        if path.suffix == ".recording" or "-part" in path.stem.removeprefix(table.stem):
-            continue  # says which folder was studied, or belongs to a part of the study
+        if path.suffix == ".recording" or (path.suffix == ".png" and markdown_image(path.name) not in made):
+            continue  # says which folder was studied, or is a chart of another study, like dynamic-converged
         shutil.copy(path, kept / path.name.replace(table.stem, name))
-    text = f"{table.read_text().replace(table.stem, name)}\nMade by `benchmarks/studies.py`: {where}\n"
+    text = f"{made.replace(table.stem, name)}\nMade by `benchmarks/studies.py`: {where}\n"
     (kept / f"{name}.md").write_text(text)
     print(text)
 

@@ -2,9 +2,12 @@
 
 import importlib
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import provenance
 import pytest
+import studies
 from registry import REGISTRY
 
 PROGRAMS = sorted({result.command[0].removesuffix(".py") for result in REGISTRY})
@@ -48,3 +51,17 @@ def test_a_checkout_with_changes_is_refused_before_anything_is_measured(
     with pytest.raises(SystemExit) as ended:
         program.main()
     assert ended.value.code == REFUSED
+
+
+def test_a_study_keeps_the_charts_of_its_own_table_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table, own = tmp_path / "ada-dynamic.md", {"ada-dynamic.csv", "ada-dynamic.png", "ada-dynamic-pictures.png"}
+    for name in own | {"ada-dynamic.recording", "ada-dynamic-part.png", "ada-dynamic-converged.png"}:
+        (tmp_path / name).touch()
+    table.write_text("![ada-dynamic.png](<ada-dynamic.png>)\n![ada-dynamic-pictures.png](<ada-dynamic-pictures.png>)\n")
+    flow = SimpleNamespace(benchmark=SimpleNamespace(fn=lambda *_: table))
+    changes = {"import_module": lambda _: flow, "provenance": dict, "provenance_line": str, "clean_commit": id}
+    for name, change in (changes | {"RESULTS": tmp_path / "results"}).items():
+        monkeypatch.setattr(studies, name, change)
+    monkeypatch.setattr(sys, "argv", ["studies.py", "store", "ada", "benchmark", "dynamic"])
+    studies.main()
+    assert {path.name for path in (tmp_path / "results" / "benchmark").iterdir()} == own | {table.name}
