@@ -120,8 +120,9 @@ def training_distance_chart(
                 "markeredgewidth": 0,
             }
             panel.plot(*zip(*points, strict=True), **method_style)
-        draw_curves(panel, {name: [(x, y) for x, y, _ in found] for name, found in means.items()}, method_styles)
-        for x, _, count in max(means.values(), key=len):
+        lines = {name: [(x, y) for x, y, _ in found.values()] for name, found in means.items()}
+        draw_curves(panel, lines, method_styles)
+        for x, _, count in max(means.values(), key=len).values():
             panel.annotate(f"n = {count}", (x, 0.01), xycoords=panel.get_xaxis_transform(), ha="center", fontsize=7)
         _decorate(panel, title, *labels)
     for panel in slots[len(panels) :]:

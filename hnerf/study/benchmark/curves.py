@@ -46,10 +46,10 @@ def bin_edges(clouds: Iterable[Sequence[Point]], bins: int) -> list[float]:
     return np.linspace(min(x), max(x), bins + 1).tolist() if x else []
 
 
-def bin_means(points: Sequence[Point], edges: Sequence[float]) -> list[tuple[float, float, int]]:
-    """Return mean x, mean y and the number of points between each two successive edges, for bins that are not empty.
-    The last edge is inclusive."""
+def bin_means(points: Sequence[Point], edges: Sequence[float]) -> dict[int, tuple[float, float, int]]:
+    """Return mean x, mean y and the number of points between each two successive edges, by the number of the bin, for
+    bins that are not empty. The last edge is inclusive."""
     found = np.array(points)
     place = np.digitize(found[:, 0], edges[1:-1])
-    parts = [found[place == k] for k in range(len(edges) - 1)]
-    return [(float(part[:, 0].mean()), float(part[:, 1].mean()), len(part)) for part in parts if len(part)]
+    parts = {k: found[place == k] for k in sorted(set(place.tolist()))}
+    return {k: (float(part[:, 0].mean()), float(part[:, 1].mean()), len(part)) for k, part in parts.items()}

@@ -133,6 +133,15 @@ def test_quality_by_view_angle_and_lead_at_every_angle() -> None:
     assert failed.startswith("no: 4 cameras: fast nothing, nerf has scores; 2 cameras: +8.0")
 
 
+def test_only_bins_of_angles_that_both_methods_have_are_compared() -> None:
+    """With bodies fitted under other settings, an image falls into the next bin, or is not there."""
+    result = synthetic_result("ahead_at_every_angle")
+    rows = result["variants"]["4 cameras"]["methods"]["nerf"]["novel_view"]["per_image"]
+    rows[1] |= {"view_angle_deg": rows[1]["view_angle_deg"] + 15, "psnr": 99.0}
+    del rows[2:-1]
+    assert verdict(result).startswith("yes: 4 cameras: +4.0 to +4.0 dB to nerf; ")
+
+
 @pytest.mark.parametrize(("slope", "seen"), [(0.0, "yes: 4 cameras: correlation -0.32 over 4 images"), (0.1, "no: ")])
 def test_scores_of_new_poses_have_no_trend_with_pose_distance(slope: float, seen: str) -> None:
     """Without a slope, deviations of x are -45, -15, 15, 45 and of y 0, 1, -1, 0: -30 / sqrt(4500 x 2)."""

@@ -45,7 +45,7 @@ def test_the_value_of_a_curve_before_between_and_after_its_points() -> None:
 def test_bins_are_equally_wide_and_empty_ones_are_left_out() -> None:
     points = [(9.0, 8.0), (0.0, 2.0), (1.0, 6.0), (2.0, 4.0)]
     assert bin_edges([points[:2], points[2:]], 3) == [0.0, 3.0, 6.0, 9.0]
-    assert bin_means(points, [0.0, 3.0, 6.0, 9.0]) == [(1.0, 4.0, 3), (9.0, 8.0, 1)]
-    assert bin_means([(3.0, 1.0)], [0.0, 3.0, 6.0]) == [(3.0, 1.0, 1)]  # an edge belongs to the next bin
-    assert bin_means(points[:1], bin_edges([points[:1]], 5)) == [(9.0, 8.0, 1)]
+    assert bin_means(points, [0.0, 3.0, 6.0, 9.0]) == {0: (1.0, 4.0, 3), 2: (9.0, 8.0, 1)}
+    assert bin_means([(3.0, 1.0)], [0.0, 3.0, 6.0]) == {1: (3.0, 1.0, 1)}  # an edge belongs to the next bin
+    assert bin_means(points[:1], bin_edges([points[:1]], 5)) == {4: (9.0, 8.0, 1)}
     assert bin_edges([], 3) == []
