@@ -13,6 +13,7 @@ import csv
 import io
 import math
 from collections.abc import Iterator, Mapping
+from statistics import fmean
 from typing import Any
 
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
@@ -95,13 +96,14 @@ def smallest_timed_px(result: Mapping[str, Any]) -> str:
 
 
 def sweep_curves(result: Mapping[str, Any], key: str = "psnr") -> dict[str, list[Point]]:
-    """Return, by method, a score of the finished model over the number of cameras or frames, in ascending order."""
-    curves: dict[str, list[Point]] = {}
+    """Return, by method, a score of the finished model over the number of cameras or frames, in ascending order; the
+    mean of variants that calibration left with the same number."""
+    curves: dict[str, dict[int, list[float]]] = {}
     for variant in result["variants"].values():
         for name, scores in scored_methods(variant).items():
             if (value := pick(scores[scores["split"]], key)) is not None:
-                curves.setdefault(name, []).append((scores["trained_on"][result["sweep"]], value))
-    return {name: sorted(points) for name, points in curves.items()}
+                curves.setdefault(name, {}).setdefault(scores["trained_on"][result["sweep"]], []).append(value)
+    return {name: [(n, fmean(values)) for n, values in sorted(found.items())] for name, found in curves.items()}
 
 
 def scatter_points(variant: Mapping[str, Any], split: str, x: str, y: str = "psnr") -> dict[str, list[Point]]:

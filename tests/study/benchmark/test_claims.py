@@ -69,6 +69,14 @@ def test_more_is_better_at_every_step(psnr: tuple[float, ...], chamfer: tuple[fl
     assert verdict(result).startswith(seen)
 
 
+def test_variants_that_calibration_left_with_the_same_cameras_do_not_show_that_more_is_better() -> None:
+    """Of four cameras, calibration leaves out two."""
+    result = synthetic_result("more_is_better")
+    for scores_of_four in result["variants"]["4 cameras"]["methods"].values():
+        scores_of_four["trained_on"]["cameras"] = 2
+    assert verdict(result) == "no figures."
+
+
 def test_the_first_method_loses_least() -> None:
     assert verdict(synthetic_result("loses_least")) == (
         "yes: fast loses 2.0 dB, nerf 6.0 dB; fast loses Chamfer 0.100, nerf Chamfer 0.400."
