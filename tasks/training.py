@@ -15,7 +15,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("training", version="37", resumable=True, checkpoint=NAME)
+@stage("training", version="38", resumable=True, checkpoint=NAME)
 def train(
     out: Path,
     recording: Artifact,

@@ -85,6 +85,7 @@ class PaperField(Field):
         points = rays.points(depths).flatten(0, 1)
         row = rays.frame.repeat_interleave(depths.shape[1])
         inside = ((points >= region.lower_m[row]) & (points <= region.upper_m[row])).all(-1)
+        inside.view_as(depths)[:, -1] = False  # it is opaque: it stands for all that lies beyond, also where a box ends
         train = draws.probe is not None and torch.is_grad_enabled()
         pick = torch.nonzero(inside)[:, 0]
         queried = points[pick].detach().requires_grad_(train)

@@ -137,6 +137,21 @@ def test_a_person_outside_the_scene_is_sampled(walk_m: float) -> None:
     assert (field.radiance.asked[0][0][:, 3] != 1).tolist() == [False, False, True, False]
 
 
+def test_no_background_is_seen_where_a_ray_leaves_scene_and_box_at_once() -> None:
+    """The scene ends at y = 7.1 m with the box of the second body, beside which the ray passes along y, in empty space:
+    what is opaque is its last sample, which is the background."""
+    root = torch.eye(4).repeat(2, 1, 1)
+    root[1, 1, 3] = 6.0
+    field = PaperField(RIG, root, SETTINGS.model_copy(update={"samples": 64}), static=False)
+    field.radiance, field.residual = Fog(), Slope()
+    field.radiance.density.data.fill_(1e-3)
+    standing = PosedBodies(RIG, 0 * THETA, root, RIG.vertices_m)
+    conditions = Conditions.of(RIG, 0 * THETA, root, torch.arange(2), 2.0)
+    ray = Rays(torch.tensor([[1.05, -3.0, 0.5]]), torch.tensor([[0.0, 1, 0]]), torch.tensor([1]))
+    rendered = field.render_rays(field.scene(standing, conditions), ray)
+    assert 1e-4 < rendered[0, 3] < 1e-3
+
+
 def test_coarse_samples_are_evaluated_before_all_samples() -> None:
     field = field_of()
     sampled(field)
