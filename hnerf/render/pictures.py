@@ -16,7 +16,7 @@ from torch import Tensor
 from hnerf.avatar.avatar import Avatar, Rendering
 from hnerf.avatar.surface import normals_and_distances, posed_surface
 from hnerf.capture.capture import read_rgb, write_image
-from hnerf.capture.footage import Video
+from hnerf.capture.footage import MIN_FPS, Video
 from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
 
@@ -54,10 +54,11 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
 
 
 def write_video(folder: Path, fps: float, path: Path, read: Callable[[Path], np.ndarray] = read_rgb) -> None:
-    """Encode the PNG files of a folder, in order, as an MPEG-4 video; `read` loads each as (H, W, 3) uint8 RGB. Raises
-    OSError if not all frames can be read back."""
+    """Encode the PNG files of a folder, in order, as an MPEG-4 video of at least MIN_FPS; `read` loads each as (H, W,
+    3) uint8 RGB. Raises OSError if not all frames can be read back."""
     files = sorted(folder.glob("*.png"))
     height_px, width_px = read(files[0]).shape[:2]
+    fps = max(fps, MIN_FPS)  # two frames may be an hour apart; below about 0.001, no file would be written
     fps = round(fps, max(0, int(math.log10(65535 / fps))))  # MPEG-4's clock has at most 65535 ticks a second
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
     for file in files:

@@ -118,13 +118,13 @@ def test_every_kind_of_image_is_also_written_as_a_video(tmp_path: Path) -> None:
             assert picture.rgb[0, 0].max() < 16  # background
 
 
-@pytest.mark.parametrize("fps", [200 / 3, 29.97, 1000 / 3])
+@pytest.mark.parametrize("fps", [200 / 3, 29.97, 1000 / 3, 30 / 36_000])
 def test_a_video_has_the_frame_rate_as_exactly_as_the_format_allows(fps: float, tmp_path: Path) -> None:
     (tmp_path / "colour").mkdir()
     for number in range(2):
         cv2.imwrite(str(tmp_path / "colour" / f"{number:06d}.png"), np.zeros((16, 16, 3), np.uint8))
     write_video(tmp_path / "colour", fps, tmp_path / "colour.mp4")
-    assert Video.open(tmp_path / "colour.mp4").fps == pytest.approx(fps, rel=1e-3)
+    assert Video.open(tmp_path / "colour.mp4").fps == pytest.approx(max(fps, 0.01), rel=1e-3)
 
 
 def test_grey_levels_of_depths_by_hand(tmp_path: Path) -> None:
