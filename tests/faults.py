@@ -304,7 +304,7 @@ FAULTS = (
     Fault("bvh-fingers", "render/bvh_motion", "len(joints.keys() - AT_REST)", "len(joints)"),
     Fault("bvh-bone-axes", "asset/bvh_file", " @ skeleton.rotations[1:].swapaxes(1, 2)", ""),
     Fault("motion-fingers", "render/motion", "if name in names:", "if name in names and own.rig.free[j]:"),
-    Fault("render-rate", "render/subject", "motion.fps / median_step(body.frames)", "motion.fps"),
+    Fault("render-rate", "render/pictures", "return fps / step", "return fps"),
     Fault("texture-border", "asset/texture", "image[nearest[0], nearest[1]]", "image"),
     Fault("root-median", "asset/staging", "np.median(points_m[..., 1].min(1))", "np.min(points_m[..., 1].min(1))"),
     Fault("regions-strongest", "asset/regions", "dense_weights.argmax(1)", "dense_weights.argmin(1)"),

@@ -23,12 +23,13 @@ from hnerf.progress import tracked
 COVERED = 0.5  # alpha from which a pixel has a depth and a normal
 NEAR_GREY, FAR_GREY = 255, 64  # grey levels at the ends of a depth video's range
 NORMAL_STEP_M = 0.005  # of differences of the signed distance
+MAX_GAP = 2  # median steps between frame numbers; beyond it is another recording, as for the fit
 Shot = tuple[Camera, int]  # a camera, and the frame of avatar.body whose pose is shown
 
 
 def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], fps: float, out: Path) -> None:
     """Write `<kind>/<number>.png` (`.ply` for mesh) for every shot and each kind in `what`, and the images of each kind
-    as `<kind>.mp4`.
+    as `<kind>.mp4`. fps: of the frame numbers; a picture lasts as long as its frame (`frame_times`).
 
     colour: 8-bit over black. mask: coverage, 0 to 255. depth: 16-bit, millimetres along the viewing axis, 0 off the
     person. normals: 8-bit, (n + 1) / 2 with x right, y up, z towards the camera, black off the person. mesh: the
@@ -48,25 +49,46 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
             else:
                 posed_surface(avatar, shot[1]).export(mesh)
                 meshes[shot[1]] = mesh
+    rate, lasts = frame_times([frame for _, frame in shots], fps)
     for kind in [kind for kind in what if kind != "mesh"]:
         read = partial(read_depth_grey, span_mm=depth_span_mm(out / kind)) if kind == "depth" else read_rgb
-        write_video(out / kind, fps, out / f"{kind}.mp4", read)
+        write_video(out / kind, rate, out / f"{kind}.mp4", read, lasts)
 
 
-def write_video(folder: Path, fps: float, path: Path, read: Callable[[Path], np.ndarray] = read_rgb) -> None:
+def frame_times(frames: Sequence[int], fps: float) -> tuple[float, list[int]]:
+    """Return the rate of a video that shows frames of these numbers, `fps` of them a second, and for how many of its
+    own frames it shows each. A gap of more than MAX_GAP median steps is shown as one of MAX_GAP."""
+    gaps = np.diff(frames)
+    ahead = gaps[gaps > 0]  # none if one pose is shown again and again; after the last frame, the first may follow
+    step = int(np.gcd.reduce(ahead)) if len(ahead) else 1
+    lasts = np.minimum(gaps, MAX_GAP * np.median(ahead) if len(ahead) else 1) // step
+    return fps / step, [*lasts.clip(min=1).astype(int).tolist(), 1]
+
+
+def write_video(
+    folder: Path,
+    fps: float,
+    path: Path,
+    read: Callable[[Path], np.ndarray] = read_rgb,
+    lasts: Sequence[int] | None = None,
+) -> None:
     """Encode the PNG files of a folder, in order, as an MPEG-4 video of at least MIN_FPS; `read` loads each as (H, W,
-    3) uint8 RGB. Raises OSError if not all frames can be read back."""
+    3) uint8 RGB. lasts: how many frames of the video each is shown for; None: one. Raises OSError if not all frames
+    can be read back."""
     files = sorted(folder.glob("*.png"))
     height_px, width_px = read(files[0]).shape[:2]
     fps = max(fps, MIN_FPS)  # two frames may be an hour apart; below about 0.001, no file would be written
     fps = round(fps, max(0, int(math.log10(65535 / fps))))  # MPEG-4's clock has at most 65535 ticks a second
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
-    for file in files:
-        writer.write(cv2.cvtColor(read(file), cv2.COLOR_RGB2BGR))
+    lasts = lasts or [1] * len(files)
+    for file, times in zip(files, lasts, strict=True):
+        picture = cv2.cvtColor(read(file), cv2.COLOR_RGB2BGR)
+        for _ in range(times):
+            writer.write(picture)
     writer.release()
     count = len(Video.open(path).frames)
-    if count != len(files):
-        raise OSError(f"{path}: {count} of {len(files)} frames were written")
+    if count != sum(lasts):
+        raise OSError(f"{path}: {count} of {sum(lasts)} frames were written")
 
 
 def depth_span_mm(folder: Path) -> tuple[int, int]:

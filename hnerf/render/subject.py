@@ -12,7 +12,6 @@ from hnerf.avatar.finished import avatar_of, readable, recording_of, require_fil
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
 from hnerf.capture.capture import Capture
-from hnerf.capture.timing import median_step
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 from hnerf.geometry.camera import Camera
@@ -97,15 +96,14 @@ def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
         motion = read_motion(options.motion, options.frames)
         motion = dataclasses.replace(motion, body=retarget(own, motion, capture.up, options.motion), up=capture.up)
     body = motion.body
-    fps = motion.fps / median_step(body.frames)
     if options.between is not None:
         for frame in options.between:
             select_frames(body.frames, str(frame), options.motion or subject)
-        body, fps = interpolate_poses(body, *options.between, options.pictures or ORBIT_PICTURES), motion.fps
+        body = interpolate_poses(body, *options.between, options.pictures or ORBIT_PICTURES)
     if options.shape or options.volume is not None:
         rig = with_shape_values(own.rig, options.shape)
         body = transfer_poses(rig if options.volume is None else with_volume(rig, options.volume), body, capture.up)
-    return Motion(body, fps, capture.up)
+    return Motion(body, motion.fps, capture.up)
 
 
 def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Camera]:

@@ -12,7 +12,15 @@ from hnerf.avatar.avatar import Avatar, Rendering
 from hnerf.capture.footage import Video
 from hnerf.geometry.camera import Camera
 from hnerf.render import pictures
-from hnerf.render.pictures import depth_image, depth_span_mm, normal_image, read_depth_grey, write_pictures, write_video
+from hnerf.render.pictures import (
+    depth_image,
+    depth_span_mm,
+    frame_times,
+    normal_image,
+    read_depth_grey,
+    write_pictures,
+    write_video,
+)
 from tests.evaluation.ball import RADIUS_M, RENDERED, SIZE_PX, BallAvatar, ball_camera, ball_fit, ball_mask, centre_m
 
 CAMERA = ball_camera("a", 0.0)  # 0.75 m from the ball, on the x axis
@@ -125,6 +133,20 @@ def test_a_video_has_the_frame_rate_as_exactly_as_the_format_allows(fps: float, 
         cv2.imwrite(str(tmp_path / "colour" / f"{number:06d}.png"), np.zeros((16, 16, 3), np.uint8))
     write_video(tmp_path / "colour", fps, tmp_path / "colour.mp4")
     assert Video.open(tmp_path / "colour.mp4").fps == pytest.approx(max(fps, 0.01), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("frames", "rate", "lasts"),
+    [
+        ([4], 30.0, [1]),
+        ([4, 4, 4], 30.0, [1, 1, 1]),
+        ([0, 6, 12, 0, 6], 5.0, [1, 1, 1, 1, 1]),  # played again
+        ([0, 4, 8, 14, 16], 15.0, [2, 2, 3, 1, 1]),
+        ([0, 2, 4, 6, 5000, 5002], 15.0, [1, 1, 1, 2, 1, 1]),  # two recordings
+    ],
+)
+def test_times_of_frames_by_hand(frames: list[int], rate: float, lasts: list[int]) -> None:
+    assert frame_times(frames, 30.0) == (rate, lasts)
 
 
 def test_grey_levels_of_depths_by_hand(tmp_path: Path) -> None:

@@ -117,6 +117,18 @@ def test_every_second_frame_lasts_twice_as_long(subject: Path, tmp_path: Path) -
     assert (len(video.frames), video.fps) == (2, 5.0)  # recorded at 10 a second
 
 
+def test_a_frame_lasts_until_the_next_one(copy: Path, tmp_path: Path) -> None:
+    """Of frames 0, 2 and 3, recorded at 10 a second, the first lasts twice as long as the others."""
+    body = BodyFit.load(copy / "training")
+    dataclasses.replace(body, frames=(0, 2, 3)).save(copy / "training")
+    assert main(["render", str(copy), "--camera", "0", "--what", "mask", "--out", str(tmp_path / "out")]) == 0
+    assert numbers(tmp_path / "out", "mask") == ["000000", "000001", "000002"]
+    video = Video.open(tmp_path / "out" / "mask.mp4")
+    assert (len(video.frames), video.fps) == (4, 10.0)
+    first, second, third, last = (picture.rgb.astype(int) for picture in video.read(range(4)))
+    assert abs(first - second).max() < 32 < min(abs(second - third).max(), abs(third - last).max())
+
+
 def test_the_size_sets_the_longer_side(subject: Path) -> None:
     capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
     wide = dataclasses.replace(capture, cameras=capture.cameras | {"2": capture.cameras["2"].resized(80, 40)})
