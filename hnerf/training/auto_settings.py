@@ -183,7 +183,10 @@ def _steps(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
 
 
 def _outline_distance_px(mask: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Return the distances (P,) of a mask's outline from the body's silhouette, negative inside it."""
+    """Return the distances (P,) of a mask's outline from the body's silhouette, negative inside it; none if the body
+    fills the image or is not in it."""
+    if covered.all() or not covered.any():
+        return np.zeros(0)
     outline = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     outwards = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     inwards = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from hnerf.capture.masks import Masks, encode
 from hnerf.config import TrainingSettings
@@ -187,3 +188,18 @@ def test_shells_contain_99_percent_of_outline_points(tmp_path: Path, monkeypatch
     scene = SceneStatistics.of(replace(capture, train_cameras=("0",)), masks, body)
     assert scene.outside_m == pytest.approx(49 * scene.footprint_m)
     assert scene.inside_m == pytest.approx(49 * scene.footprint_m)
+
+
+@pytest.mark.parametrize("close", [False, True])
+def test_masks_are_not_measured_where_the_image_has_no_outline_of_the_body(tmp_path: Path, close: bool):
+    """In frame 0 only a sleeve is left in the image, not the body; or the body fills the image, where masks have a
+    hole. Distances to an outline that is not there would make the shell as thick as it can be."""
+    capture, masks, body = record(tmp_path)
+    alone = replace(capture, train_cameras=("0",))
+    camera = capture.cameras["0"]
+    body.root[0, :3, 3] += torch.from_numpy(-3.9 * camera.forward if close else 20 * camera.R[0]).float()
+    mask = np.full((SIZE_PX, SIZE_PX), close)
+    mask[8:24, -2:] = not close
+    seen = Masks(masks.encoded | {("0", 0): encode(mask)}, {})
+    scene = SceneStatistics.of(alone, seen, body)
+    assert max(scene.outside_m, scene.inside_m) < 1
