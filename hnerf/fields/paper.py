@@ -37,7 +37,7 @@ class PaperField(Field):
         return cls(body.rig, body.root, settings, static)
 
     def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
-        """Build an untrained field. root (n, 4, 4): the training poses, on which the scene is centred."""
+        """Build an untrained field. root (n, 4, 4): the poses of all fitted frames, on which the scene is centred."""
         super().__init__()
         self.settings, self.static = settings, static
         self.whole_images = settings.rays == "image"
