@@ -118,7 +118,7 @@ REGISTRY = (
     study("stability", "quick", "fast"),
     study("stability", "fast", "fast"),
     study("stability", "published", "fast", "neural-body"),
-    ablations("fast"),
+    ablations("fast", "evaluation.max_images=48"),
     ablations(
         "paper-small", "training.steps=200", "capture.max_side_px=128", "evaluation.max_images=4", rows=PAPERS_ROWS
     ),
