@@ -48,8 +48,9 @@ class ExtremePose:
 
 
 def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[ExtremePose]:
-    """Return the poses for which the rig has joints, and the asset's expressions and physiques. rig: the asset's, in
-    body axes; skin_faces: how many of its first faces are closed skin."""
+    """Return the poses for which the rig has joints and the mesh has points to frame (a captured one may lack hands),
+    and the asset's expressions and physiques. rig: the asset's, in body axes; skin_faces: how many of its first faces
+    are closed skin."""
     everything = np.ones(len(rig.vertices_m), bool)
     poses = {
         "Arms up": (turned(rig, ARMS_UP), everything),
@@ -64,6 +65,7 @@ def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[Extre
     return [
         ExtremePose(name, points_m, shown, float(crossing_faces(points_m, staged.faces[:skin_faces]).mean()))
         for name, (points_m, shown) in surfaces.items()
+        if shown.any()
     ]
 
 

@@ -51,6 +51,14 @@ def test_a_body_without_the_needed_joints_has_no_extreme_poses(staged: StagedAva
     assert extreme_poses(faceless, clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65)), 0) == []
 
 
+def test_a_pose_that_would_frame_no_point_is_left_out(staged: StagedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clothes have no point that follows a head, as a captured mesh without hands has none that follows a hand."""
+    monkeypatch.setattr("hnerf.asset.extreme_poses.TURNED_HEAD", {"root": (0, 20, 0)})
+    rig = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))
+    shown = extreme_poses(dataclasses.replace(staged, expressions_m={}), rig, len(staged.faces))
+    assert [pose.name for pose in shown] == ["Stout"]
+
+
 def test_an_expression_is_the_sum_of_its_units(staged: StagedAvatar) -> None:
     units = {name: np.zeros((len(staged.rest_points_m), 3)) for parts in EXPRESSIONS.values() for name in parts}
     units["mouthSmileLeft"][0], units["mouthSmileRight"][1], units["jawOpen"][1] = (0.01, 0, 0), (0.02, 0, 0), (0, 1, 0)
