@@ -50,21 +50,24 @@ class Compared:
 def compare_with_field(
     capture: Capture, masks: Masks, avatar: Avatar, staged: StagedAvatar, splats: Splats | None = None
 ) -> list[Compared]:
-    """Compare at most IMAGES views of training frames: from test cameras if the recording has masks for them, else from
-    training cameras. The list is empty if no view has a mask."""
+    """Compare at most IMAGES views of training frames: from test cameras if the recording has masks for them and these
+    show the person, else from training cameras. The list is empty if no chosen view has a mask of the person."""
     tested = [view for view in all_views(capture, NOVEL_VIEW) if capture.has_given_mask(view.camera, view.frame)]
     trained = [view for view in all_views(capture, TRAINING_VIEW) if (view.camera, view.frame) in masks]
-    chosen = sample_views(tested or trained, IMAGES)
-    surfaces = _skinned_surfaces(staged, [view.frame for view in chosen])
 
-    def compare(view: View) -> Compared | None:
-        mask = _mask(capture, masks, view)
-        if not mask.any():
-            return None
-        return _compared(capture, view, mask, avatar, staged, surfaces[view.frame], splats)
+    def compare(chosen: list[View]) -> list[Compared]:
+        surfaces = _skinned_surfaces(staged, [view.frame for view in chosen])
 
-    compared = side_by_side(compare, chosen, avatar.body.theta.device)
-    return [one for one in tracked(compared, "asset against field", len(chosen)) if one]
+        def compare_view(view: View) -> Compared | None:
+            mask = _mask(capture, masks, view)
+            if not mask.any():
+                return None
+            return _compared(capture, view, mask, avatar, staged, surfaces[view.frame], splats)
+
+        compared = side_by_side(compare_view, chosen, avatar.body.theta.device)
+        return [one for one in tracked(compared, "asset against field", len(chosen)) if one]
+
+    return (tested and compare(sample_views(tested, IMAGES))) or compare(sample_views(trained, IMAGES))
 
 
 def comparison_figures(compared: list[Compared]) -> dict[str, Any]:

@@ -153,6 +153,10 @@ def test_test_cameras_with_masks_come_first(recorded: Capture, staged: StagedAva
     found = compare_with_field(tested, masks, avatar, staged)
     assert [(c.view.camera, c.view.frame) for c in found] == [("02", frame) for frame in recorded.train_frames]
     assert comparison_figures(found)["cameras"] == "test"
+    for frame in recorded.train_frames:  # whose masks say that the person is out of view
+        write_image(tested.root / f"masks/02/{frame:06d}.png", np.zeros((480, 640), np.uint8))
+    found = compare_with_field(tested, masks, avatar, staged)
+    assert [(c.view.camera, c.view.frame) for c in found] == [("01", frame) for frame in recorded.train_frames]
 
 
 def test_views_are_chosen_among_those_with_a_mask(recorded: Capture, staged: StagedAvatar) -> None:
