@@ -234,6 +234,16 @@ def test_the_person_is_framed_from_the_front(page: Page, staged: StagedAvatar) -
 
 
 @NEEDS_THREE
+def test_the_view_is_reset_to_where_the_person_is(page: Page, staged: StagedAvatar) -> None:
+    page.evaluate("viewer.setTime(viewer.avatar.duration)")
+    page.press("r")
+    last_m = staged.points_m[-1]
+    middle_m = (last_m.min(0) + last_m.max(0)) / 2
+    np.testing.assert_allclose(page.evaluate("viewer.stage.orbit.target.toArray()"), middle_m, atol=1e-3)
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.5)
+
+
+@NEEDS_THREE
 def test_a_hidden_page_frames_the_person_when_it_is_shown(page: Page) -> None:
     camera = "viewer.stage.free.position.toArray()"
     page.evaluate("viewer.stage.frame(viewer.bounds)")

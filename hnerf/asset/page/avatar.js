@@ -83,7 +83,12 @@ export class Avatar {
     });
     this.pose(0);
     const lowest = boxes.map((box) => box.min.y).sort((a, b) => a - b);
-    return { box: boxes[0], ground: lowest[Math.floor(count / 2)], forward: this.forward() };
+    return { ...this.present(), ground: lowest[Math.floor(count / 2)] };
+  }
+
+  // Returns the bounds of the present pose, and which way the person faces.
+  present() {
+    return { box: posedBox(this.mesh), forward: this.forward() };
   }
 
   // A glTF file's front is +z at rest; returns where the joints turn it, by their shares of the surface.

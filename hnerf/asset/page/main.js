@@ -218,7 +218,7 @@ function connectTheme(viewer) {
 }
 
 function connectKeys(viewer) {
-  const { stage } = viewer;
+  const { avatar, stage } = viewer;
   const keys = {
     " ": () => viewer.play(!viewer.playing),
     ",": () => viewer.step(-1),
@@ -228,7 +228,7 @@ function connectKeys(viewer) {
     c: () => viewer.choose.camera(((viewer.camera ?? 0) + 1) % (viewer.recording.cameras.length + 1)),
     r: () => {
       viewer.choose.camera(0);
-      stage.frame(viewer.bounds);
+      stage.frame({ ...viewer.bounds, ...avatar.present() });
     },
   };
   LOOKS.forEach((_, index) => (keys[index + 1] = () => viewer.choose.look(index)));
