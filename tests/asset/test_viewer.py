@@ -297,13 +297,35 @@ def test_a_recorded_camera_shows_the_avatar_over_its_photograph(page: Page, stag
     assert width / height == pytest.approx(640 / 480, abs=0.01)
     page.evaluate("viewer.stage.grid.visible = false")
     shown = page.evaluate(PICTURE)
-    canvas = cv2.imdecode(np.frombuffer(base64.b64decode(shown.split(",")[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+    canvas = decoded(shown)
     seen = cv2.resize(canvas[top : top + height, left : left + width, 3], (640, 480), interpolation=cv2.INTER_AREA)
     expected = outline(staged.points_m[2] @ staged.stage_from_world, staged.faces)
     overlap = ((seen > 127) & expected).sum() / ((seen > 127) | expected).sum()
     assert overlap > 0.97
     page.click("#cameras label:nth-child(1)")
     assert page.evaluate("document.getElementById('photograph').hidden")
+
+
+@NEEDS_THREE
+def test_a_long_lens_shows_a_person_half_a_kilometre_away(page: Page) -> None:
+    """The column is 5 m from the camera. At 100 times that, 100 times the focal length shows the same size."""
+    page.evaluate("viewer.setTime(0), viewer.stage.grid.visible = false")
+    near, far = (
+        page.evaluate(
+            f"(({{fx, fy, pose, ...camera}}) => (viewer.stage.lookThrough({{...camera, fx: {k} * fx, fy: {k} * fy, "
+            f"pose: pose.map((value, i) => value + (i === 11 && 5 * ({k} - 1)))}}), {PICTURE}))"
+            "(viewer.recording.cameras[0])"
+        )
+        for k in (1, 100)
+    )
+    page.evaluate("viewer.stage.lookThrough(null)")
+    covered = [(decoded(shown)[..., 3] > 127).sum() for shown in (near, far)]
+    assert covered[0] > 1000 and covered[1] == pytest.approx(covered[0], rel=0.1)
+
+
+def decoded(uri: str) -> np.ndarray:
+    """Return the image (H, W, 4) of a data URI."""
+    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def outline(world_m: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ import { OrbitControls } from "three/OrbitControls.js";
 
 const FIELD_OF_VIEW_DEG = 30;
 const NEAR_M = 0.05;
-const FAR_M = 200;
+const FAR_M = 1000; // as in USD; a long lens may be hundreds of metres away
 const KEY_TURN_RAD = 0.1;
 const KEY_ZOOM = 1.1;
 const MARGIN = 1.12; // height of the image over that of the person
