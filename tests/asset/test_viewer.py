@@ -234,9 +234,10 @@ def test_the_person_is_framed_from_the_front(page: Page, staged: StagedAvatar) -
 
 
 @NEEDS_THREE
-def test_the_view_is_reset_to_where_the_person_is(page: Page, staged: StagedAvatar) -> None:
-    page.evaluate("viewer.setTime(viewer.avatar.duration)")
-    page.press("r")
+@pytest.mark.parametrize("key", ["r", "R"])  # R with Caps Lock
+def test_the_view_is_reset_to_where_the_person_is(key: str, page: Page, staged: StagedAvatar) -> None:
+    page.evaluate("viewer.setTime(0), viewer.stage.frame(viewer.bounds), viewer.setTime(viewer.avatar.duration)")
+    page.press(key)
     last_m = staged.points_m[-1]
     middle_m = (last_m.min(0) + last_m.max(0)) / 2
     np.testing.assert_allclose(page.evaluate("viewer.stage.orbit.target.toArray()"), middle_m, atol=1e-3)

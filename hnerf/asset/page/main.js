@@ -238,8 +238,9 @@ function connectKeys(viewer) {
     if (tagName === "SELECT") return; // letters choose an option there
     if (event.key === " " && (["BUTTON", "SUMMARY"].includes(tagName) || type === "checkbox")) return; // presses it
     const turned = event.target === stage.canvas && stage.keyed(event.key);
-    if (!turned && !(event.key in keys)) return;
-    if (!turned) keys[event.key]();
+    const key = event.key.toLowerCase(); // with Caps Lock, letters are capital
+    if (!turned && !(key in keys)) return;
+    if (!turned) keys[key]();
     viewer.changed = true;
     event.preventDefault();
   });
