@@ -65,7 +65,11 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
         if len(page.encode()) <= MAX_BYTES:
             break
     else:
-        log.warning("%s: over %d MB even with a small texture: the motion is long", path.name, MAX_BYTES // 10**6)
+        log.warning(
+            "%s: over %d MB even with a small texture: the motion is long or the mesh fine",
+            path.name,
+            MAX_BYTES // 10**6,
+        )
     path.write_text(page, encoding="utf-8")
     return path.name
 

@@ -141,7 +141,7 @@ def test_a_page_that_is_too_large_gets_a_smaller_texture(
     assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (16, 16, 3)
     monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", 1)
     write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
-    assert "viewer.html: over 0 MB even with a small texture: the motion is long" in caplog.text
+    assert "viewer.html: over 0 MB even with a small texture: the motion is long or the mesh fine" in caplog.text
 
 
 @NEEDS_THREE
