@@ -179,6 +179,17 @@ def test_each_motion_is_stepped_through_at_its_own_rate_to_its_last_frame(page: 
 
 
 @NEEDS_THREE
+def test_a_single_captured_pose_is_a_frame_and_not_the_rest_pose(page: Page) -> None:
+    clock = "document.getElementById('clock').textContent"
+    lasts_s = page.evaluate("viewer.setMotion(0), viewer.avatar.duration")
+    page.evaluate("viewer.avatar.motion.duration = 0, viewer.setTime(0)")
+    assert page.evaluate(clock) == "frame 3 · 0.00 s"
+    page.evaluate(f"viewer.avatar.motion.duration = {lasts_s}, viewer.setMotion(2)")
+    assert page.evaluate(clock) == "at rest"
+    page.evaluate("viewer.setMotion(0)")
+
+
+@NEEDS_THREE
 def test_a_slider_turns_its_joint_on_top_of_the_motion(page: Page) -> None:
     page.evaluate("viewer.setTime(0.2)")
     quaternion = f"{LAST_JOINT}.quaternion.toArray()"

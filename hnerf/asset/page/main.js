@@ -107,7 +107,7 @@ function connectMotion(viewer) {
 
 function showTime({ avatar, recording }) {
   const frame = avatar.showsRecording ? `frame ${recording.first_frame + Math.round(avatar.time * recording.fps)} · ` : "";
-  const text = avatar.duration ? `${frame}${avatar.time.toFixed(2)} s` : "at rest";
+  const text = avatar.motion ? `${frame}${avatar.time.toFixed(2)} s` : "at rest";
   find("time").value = avatar.time;
   find("time").setAttribute("aria-valuetext", text);
   find("clock").textContent = text;
