@@ -319,6 +319,17 @@ def test_a_recorded_camera_shows_the_avatar_over_its_photograph(page: Page, stag
 
 
 @NEEDS_THREE
+@pytest.mark.parametrize("fps", [10, 10_000])
+def test_the_next_photograph_is_found_at_any_frame_rate(fps: int, page: Page) -> None:
+    besides = (
+        "(({constructor}) => { const found = new constructor(null, null, %d);"
+        "found.camera = {photographs: [0, 1, 2].map((frame) => ({time_s: frame / %d}))};"
+        "return [-1, 1].map((direction) => found.beside(1 / %d, direction).time_s); })(viewer.photographs)"
+    )
+    assert page.evaluate(besides % (fps, fps, fps)) == pytest.approx([0, 2 / fps])
+
+
+@NEEDS_THREE
 def test_a_long_lens_shows_a_person_half_a_kilometre_away(page: Page) -> None:
     """The column is 5 m from the camera. At 100 times that, 100 times the focal length shows the same size."""
     page.evaluate("viewer.setTime(0), viewer.stage.grid.visible = false")

@@ -25,7 +25,7 @@ export class Photographs {
   // Returns the photograph before (-1) or after (1) an instant, round the end.
   beside(time, direction) {
     const sorted = direction > 0 ? this.camera.photographs : this.camera.photographs.toReversed();
-    return sorted.find((photograph) => direction * (photograph.time_s - time) > 1e-3) ?? sorted[0];
+    return sorted.find((photograph) => direction * (photograph.time_s - time) * this.fps > 0.1) ?? sorted[0];
   }
 
   // Shows the photograph nearest to an instant, pale if it is of another instant or if the motion is not the recorded
