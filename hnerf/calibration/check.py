@@ -28,6 +28,7 @@ from hnerf.calibration.report import CalibrationReport, CameraVerdict
 from hnerf.calibration.sizes import size_reasons
 from hnerf.calibration.synchronise import Timing, measure_timing, synchronise_capture
 from hnerf.capture.capture import Capture
+from hnerf.capture.standing import NEAR_STATURE
 from hnerf.capture.subject import ranked_people
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
@@ -83,7 +84,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         raise InputError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
     held_out_px |= refinement.held_out_px
-    notes += [*refinement.notes, *_height_notes(after.body_height_m)]
+    notes += [*refinement.notes, *_height_notes(after.body_height_m, capture.stature_m)]
     return CalibrationReport(
         every,
         verdicts,
@@ -156,18 +157,20 @@ def _check_height(capture: Capture, found: Measure) -> None:
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     odd = [f"camera {camera.name}: {reason}" for camera in cameras for reason in intrinsics_reasons(camera)]
     cause = f"the translations look like {unit}; " if unit else f"{odd[0]}; calibrate it again, or else " if odd else ""
-    factor = UNITS_M[unit] if unit else USUAL_HEIGHT_M / found.body_height_m
+    factor = UNITS_M[unit] if unit else (capture.stature_m or USUAL_HEIGHT_M) / found.body_height_m
     raise InputError(
         f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_unit_advice(factor)}"
     )
 
 
-def _height_notes(height_m: float) -> list[str]:
-    """Return a note on the person's height and, if it is unusual, on what to do if it is wrong."""
-    low, high = COMMON_HEIGHT_M
+def _height_notes(height_m: float, stature_m: float | None) -> list[str]:
+    """Return a note on the person's height and, if it is unusual or not the stated one (None: none is stated), on what
+    to do if it is wrong."""
+    low, high = COMMON_HEIGHT_M if stature_m is None else (share * stature_m for share in NEAR_STATURE)
     if np.isnan(height_m):
         return []
-    doubt = f": if that is wrong, {_unit_advice(USUAL_HEIGHT_M / height_m)}" if not low <= height_m <= high else ""
+    factor = (stature_m or USUAL_HEIGHT_M) / height_m
+    doubt = "" if low <= height_m <= high else f": if that is wrong, {_unit_advice(factor)}"
     return [f"the person is {height_m:.2f} m tall{doubt}"]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.bundle import zoomed
-from hnerf.calibration.check import _change_reasons, _rounded, check_calibration
+from hnerf.calibration.check import _change_reasons, _height_notes, _rounded, check_calibration
 from hnerf.calibration.diagnosis import (
     MISTAKES,
     body_height_m,
@@ -283,6 +283,16 @@ def test_an_unusual_height_is_noted_not_refused(tmp_path: Path) -> None:
     # 0.6 of the figure's 1.793 m; 1.7 / 1.076 = 1.58.
     assert note.startswith("the person is 1.08 m tall: if that is wrong, in capture.toml multiply units")
     assert float(note.split()[-1]) == pytest.approx(1.58, abs=0.01)
+
+
+def test_a_stated_stature_tells_the_unit_and_which_heights_are_usual(tmp_path: Path) -> None:
+    """The figure of 1.793 m, 0.2 times as large, is 0.359 m tall; a child of 1.2 m takes 3.35 times the unit."""
+    small = recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=0.2 * c.t_m), noise_px=0)
+    with pytest.raises(InputError, match=r"0.3587 m tall; .* by 3.345$"):
+        check_calibration(dataclasses.replace(small, stature_m=1.2), SETTINGS)
+    assert _height_notes(1.2, 1.2) == ["the person is 1.20 m tall"]
+    ((note,), (usual,)) = (_height_notes(1.45, stature_m) for stature_m in (1.8, None))
+    assert note == usual + ': if that is wrong, in capture.toml multiply units ("m" is 1, "mm" 0.001) by 1.241'
 
 
 def test_swapped_camera_files_are_explained_by_no_known_mistake(tmp_path: Path) -> None:
