@@ -134,7 +134,7 @@ def synchronise_capture(
     farthest = max(off_frames, key=lambda name: abs(off_frames[name]))
     too_far = abs(off_frames[farthest]) > MAX_DISTANCE_FRAMES * capture.frame_step
     if 2 * len(lost) > len(capture.frames) or not synchronised.train_frames or too_far:
-        raise InputError(f"{capture.name}: {_cut_advice(capture.train_cameras, offsets)}")
+        raise InputError(f"{capture.name}: {_cut_advice(capture.train_cameras, offsets, capture.frame_step)}")
     if synchronised.frame_step != capture.frame_step:
         what = (
             f"frames in between were not ingested: images of camera {farthest} are "
@@ -146,10 +146,11 @@ def synchronise_capture(
     return synchronised, held_out_px, notes
 
 
-def _cut_advice(cameras: Sequence[str], offsets: dict[str, float]) -> str:
+def _cut_advice(cameras: Sequence[str], offsets: dict[str, float], frame_step: int) -> str:
+    """Return what to cut from recordings whose frame numbers are `frame_step` apart."""
     late = ", ".join(f"camera {name} by {offset:+.2f} frames" for name, offset in offsets.items())
     earliest = min(offsets.get(name, 0.0) for name in cameras)
-    cuts = {name: round(offsets.get(name, 0.0) - earliest) for name in cameras}
+    cuts = {name: round((offsets.get(name, 0.0) - earliest) / frame_step) for name in cameras}
     orders = ", ".join(f"{cut} from camera {name}" for name, cut in cuts.items() if cut)
     return (
         f"out of step: {late}; run `hnerf synchronise`, after removing clocks.toml if there is one; or cut frames from "

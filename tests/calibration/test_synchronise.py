@@ -145,6 +145,9 @@ def test_offsets_are_in_recorded_frames_if_images_are_numbered_in_fives(
     synchronised, _, notes = synchronise_capture(capture, ring(4), recorded({}), SETTINGS)
     assert synchronised.frames == numbers
     assert not notes
+    monkeypatch.setattr(synchronise_module, "synchronise", lambda *_: ({"c1": 125.0}, {}, []))
+    with pytest.raises(InputError, match=r"by \+125.00 frames; .* recordings: 25 from camera c1"):
+        synchronise_capture(capture, ring(4), recorded({}), SETTINGS)
 
 
 def test_offsets_allow_for_gaps_in_frame_numbers() -> None:
