@@ -234,9 +234,10 @@ def _timing(view: _View) -> Timing:
     Tibshirani 1993, chapter 11)."""
     every = np.arange(len(view.frames))
     halves = np.array_split(every, 2)
-    costs = _cost_by_step(view, [every, *halves])
+    enough = max(MIN_FRAMES, len(every) // 2)
+    costs = _cost_by_step(view, [every, *halves], enough)
     if len(costs) < 3:
-        return Timing.unknown(f"fewer than {MIN_FRAMES} frames in common")
+        return Timing.unknown(f"fewer than {enough} frames in common")
     lowest, *lowest_of_half = (min(costs, key=lambda step: costs[step][part]) for part in range(3))
     parabola, step = _parabola(view, lowest), median_step(view.frames)
     if np.count_nonzero(parabola.weights) < MIN_FRAMES:
@@ -286,10 +287,10 @@ def _pose_jacobian(camera: Camera, points_m: np.ndarray) -> np.ndarray:
     return focal_px[:, None] * np.concatenate([by_move @ turns, by_move], -1)
 
 
-def _cost_by_step(view: _View, parts: Sequence[np.ndarray]) -> dict[int, list[float]]:
-    """Return trimmed distances in px for each part of the frames, at every shift that leaves enough frames to
+def _cost_by_step(view: _View, parts: Sequence[np.ndarray], enough: int) -> dict[int, list[float]]:
+    """Return trimmed distances in px for each part of the frames, at every shift that leaves `enough` frames to
     compare."""
-    enough, costs = max(MIN_FRAMES, len(view.frames) // 2), {}
+    costs = {}
     for step in range(-MAX_STEPS, MAX_STEPS + 1):
         residuals, weights = view.residuals(step)
         if np.count_nonzero(weights.any(1)) >= enough:

@@ -81,6 +81,12 @@ def test_no_offset_is_measured_if_the_person_hardly_moves() -> None:
     assert any("too little motion" in reason for reason in reasons)
 
 
+def test_a_camera_that_shows_the_person_in_less_than_half_of_the_frames_has_too_few() -> None:
+    keypoints = recorded({})
+    keypoints[2, 20:, :, 2] = 0
+    assert measure_timing(ring(4), keypoints, range(FRAMES))["c2"].reason == "fewer than 24 frames in common"
+
+
 def test_two_cameras_cannot_measure_offsets() -> None:
     found = measure_timing(ring(4)[:2], recorded({})[:2], range(FRAMES))
     assert {timing.reason for timing in found.values()} == {"it takes two other cameras to place keypoints"}
