@@ -63,15 +63,16 @@ def first_poses(cameras: Sequence[Camera], keypoints: np.ndarray) -> list[Camera
             "depth; place them around the person"
         )
     starts = sorted(wide, key=lambda ij: wide[ij].agreeing, reverse=True)[:STARTS]
-    rigs, failures = [], []
-    for ij in starts:
-        try:
-            rigs.append(_add_cameras(cameras, chosen, ij, wide[ij], inlier_px))
-        except InputError as error:
-            failures.append(error)
-    if not rigs:
-        raise failures[0]
-    return min(rigs, key=lambda rig: trimmed_cost_px(rig, chosen.reshape(len(rig), -1, 3)))
+    for seen in (chosen, keypoints):  # few frames may miss the moments that a camera shares with others
+        rigs, failures = [], []
+        for ij in starts:
+            try:
+                rigs.append(_add_cameras(cameras, seen, ij, wide[ij], inlier_px))
+            except InputError as error:
+                failures.append(error)
+        if rigs:
+            return min(rigs, key=lambda rig: trimmed_cost_px(rig, seen.reshape(len(rig), -1, 3)))
+    raise failures[0]
 
 
 def _check_shared(cameras: Sequence[Camera], keypoints: np.ndarray) -> None:

@@ -50,6 +50,17 @@ def test_a_rig_is_found_without_poses() -> None:
     assert turn_deg < 0.1 and move_m < 0.01
 
 
+def test_a_camera_that_sees_the_person_for_a_moment_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of the three frames of the start is among the four that c3 shares with the others: 25 of the 50 keypoints
+    that it takes."""
+    monkeypatch.setattr(rig, "START_FRAMES", 3)
+    truth = ring(4)
+    keypoints = seen_by(truth, 0.5)
+    keypoints[3, 4:, :, 2] = 0
+    turn_deg, move_m = worst_errors(first_poses([without_pose(camera) for camera in truth], keypoints), truth)
+    assert turn_deg < 0.3 and move_m < 0.03
+
+
 def test_a_pair_with_a_wrong_pose_does_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """Most keypoints seem to fit the pair, but no other camera fits the points that it triangulates."""
     truth, found = ring(4), rig._relative_pose
