@@ -213,6 +213,16 @@ def test_frames_before_the_person_enters_do_not_count(tmp_path: Path) -> None:
     assert initial_pose(capture, observe(capture), body_model(FitSettings())).root.isfinite().all()
 
 
+def test_a_frame_that_shows_too_little_starts_where_the_frame_nearest_in_time_does(tmp_path: Path) -> None:
+    """Frame 20 is one row away from frame 1 and from frame 21."""
+    capture = record(tmp_path, moving_body((0, 1, 20, 21)), RING, ("0", "1"))
+    with edited_keypoints(tmp_path) as keypoints:
+        for seen in keypoints.values():
+            seen[2, ..., 2] = 0
+    root = initial_pose(capture, observe(capture), body_model(FitSettings())).root
+    assert torch.equal(root[2], root[3]) and not torch.equal(root[1], root[3])
+
+
 def test_runs_break_at_gaps_and_between_two_splits(tmp_path: Path) -> None:
     capture = record(tmp_path, moving_body((0, 1, 2, 5, 6)), RING, ("0",))
     one_split = replace(capture, train_frames=capture.frames, novel_pose_frames=())
