@@ -25,7 +25,7 @@ REACH_S, MIN_REACH = 0.1, 2  # seconds, and frames, on each side, to which a par
 # of an even walk apart.
 JUDGED = 0.95
 MIN_KEYPOINTS = 100  # that both cameras must see
-MAX_REFINED = 2000  # evenly spaced frames to which a clock is refined
+MAX_REFINED = 2000  # evenly spaced frames, of those that the other recording may share, to which a clock is refined
 CONVERGED = 1e-7  # seconds, and drift: a smaller step ends the refinement
 
 
@@ -223,7 +223,9 @@ def _refined(a: _Path, b: _Path, offset_s: float, fixed: np.ndarray | None, drif
     gradient (Sampson's distance, Hartley and Zisserman 2004, section 11.4.3) and has a Cauchy weight. The unknown
     offset is that in the middle of what both recorded, where it does not depend on the drift.
     """
-    times_s = a.times_s[evenly_spaced(range(len(a.times_s)), MAX_REFINED)]
+    on_b_s, reach_s = a.times_s + offset_s, ROUNDS * MAX_STEP_S  # the offset changes by no more
+    near = np.flatnonzero((on_b_s >= b.times_s[0] - reach_s) & (on_b_s <= b.times_s[-1] + reach_s)).tolist()
+    times_s = a.times_s[evenly_spaced(near, MAX_REFINED)]
     places, _, known_a = a.at(times_s)
     both = (times_s + offset_s >= b.times_s[0]) & (times_s + offset_s <= b.times_s[-1])
     middle_s = float(np.median(times_s[both])) if both.any() else 0.0
@@ -253,7 +255,7 @@ def _refined(a: _Path, b: _Path, offset_s: float, fixed: np.ndarray | None, drif
         clock[: 1 + drifts] += step[: 1 + drifts].clip(-MAX_STEP_S, MAX_STEP_S)
         if fixed is None:
             f = (f + step[1 + drifts :]) / np.linalg.norm(f + step[1 + drifts :])
-    together = _off_together(a, b, len(times_s))
+    together = _off_together(a, b, len(times_s) / len(near))
     variance = float((weights * residuals**2).sum() / weights.sum()) * together
     covariance = np.zeros((2, 2))
     covariance[: 1 + drifts, : 1 + drifts] = variance * np.linalg.pinv(normal)[: 1 + drifts, : 1 + drifts]
@@ -261,7 +263,6 @@ def _refined(a: _Path, b: _Path, offset_s: float, fixed: np.ndarray | None, drif
     return _Fit(float(clock[0] - clock[1] * middle_s), float(1 + clock[1]), middle_s, residual, covariance)
 
 
-def _off_together(a: _Path, b: _Path, frames: int) -> float:
-    """Return how many of a's used frames, evenly spaced, fall within one smoothing window. frames: number of used
-    frames."""
-    return max(1.0, max(a.window_s, b.window_s) / (a.step_s * len(a.times_s) / frames))
+def _off_together(a: _Path, b: _Path, used: float) -> float:
+    """Return how many of a's used frames, evenly spaced, fall within one smoothing window. used: their share."""
+    return max(1.0, max(a.window_s, b.window_s) / (a.step_s / used))

@@ -111,6 +111,17 @@ def test_a_drift_of_200_ppm_in_five_minutes() -> None:
     assert found.offset_s == pytest.approx(12.34, abs=0.1 / FPS)
 
 
+def test_a_long_recording_is_refined_to_the_frames_that_a_short_one_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 60 seconds, 60 frames are used: 1 of the 1.2 that both recorded if from all, 11 if from the 6.2 seconds that
+    the offset can reach."""
+    monkeypatch.setattr("hnerf.calibration.clocks.keypoints.MAX_REFINED", 60)
+    long, short = (
+        smoothed(filmed(index, seconds, offset_s)) for index, seconds, offset_s in ((0, 60, 0), (1, 1.2, -30))
+    )
+    found = pair_clock(long, short, fundamental(*ring(4)[:2]), -30.1)
+    assert found.offset_s == pytest.approx(-30, abs=0.2 / FPS)
+
+
 def test_known_cameras_tell_apart_the_steps_of_an_even_walk() -> None:
     def walk(index: int, offset_s: float) -> Track:
         own_s = np.arange(120) / FPS
@@ -144,9 +155,9 @@ def test_smoothing_reproduces_a_parabola_by_hand() -> None:
 
 def test_detections_smoothed_together_count_as_one() -> None:
     """Smoothing takes a tenth of a second on each side: 7 frames at 30 a second, 25 at 120. At 10 it takes two on each
-    side; these 5 frames last as long as 15 at 30 a second. Then, of 600 frames, every second or tenth is used."""
+    side; these 5 frames last as long as 15 at 30 a second. Then every second or tenth frame is used."""
     at_30, at_120, at_10 = (smoothed(filmed(0, 20.0, 0.0, fps=fps)) for fps in (30.0, 120.0, 10.0))
-    pairs = (at_30, at_30, 600), (at_120, at_120, 2400), (at_30, at_10, 600), (at_30, at_30, 300), (at_30, at_30, 60)
+    pairs = (at_30, at_30, 1), (at_120, at_120, 1), (at_30, at_10, 1), (at_30, at_30, 0.5), (at_30, at_30, 0.1)
     assert [_off_together(*pair) for pair in pairs] == pytest.approx([7, 25, 15, 3.5, 1])
 
 
