@@ -70,7 +70,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
             known = {"stature_m": capture.stature_m, "stature_std_m": KNOWN_STATURE_STD_M}
             settings = settings.model_copy(update=known)
         model, given = body_model(settings), capture.given_poses()
-        given_pose = initial_pose_from_given(given, model) if given else None
+        given_pose = initial_pose_from_given(given, model, capture.frames) if given else None
         observations = (
             observe(capture)
             if capture.has_keypoints or given_pose is None

@@ -1,5 +1,7 @@
 """Poses that come with a recording, used to start a fit, and in place of keypoints if the recording has none."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -21,14 +23,15 @@ PELVIS_ABOVE_HIPS_M = 0.09
 CONFIDENCE = 0.5  # of a keypoint on a given body; a detected keypoint's is at most 1
 
 
-def initial_pose_from_given(given: GivenPoses, model: BodyModel) -> Pose:
+def initial_pose_from_given(given: GivenPoses, model: BodyModel, frames: Sequence[int]) -> Pose:
     """Return given SMPL poses as poses of the model: exactly for SMPL, with the given shape; for other models on the
     average body, by the joints that correspond to SMPL's.
 
-    Frames without a pose take the pose of the nearest frame that has one.
+    frames (n,): numbers of the given rows. Frames without a pose take the pose of the nearest frame that has one.
     """
     known = given.known.nonzero()[0]
-    nearest = torch.from_numpy(known[[np.abs(known - t).argmin() for t in range(len(given.theta))]])
+    numbers = np.asarray(frames)[known]
+    nearest = torch.from_numpy(known[[np.abs(numbers - frame).argmin() for frame in frames]])
     rig = model.rig(torch.from_numpy(given.betas) if model.is_smpl else None)
     turns = rotation_from_axis_angle(torch.from_numpy(given.theta))[nearest]
     placed = torch.from_numpy(given.root)[nearest]

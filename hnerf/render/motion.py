@@ -62,7 +62,7 @@ def read_motion(path: Path, frames: str = ":") -> Motion:
     given, fps = _read_amass(path)
     chosen = list(select_frames(tuple(range(len(given.theta))), frames, path))
     given = dataclasses.replace(given, theta=given.theta[chosen], root=given.root[chosen])
-    pose = initial_pose_from_given(given, body_model(FitSettings()))
+    pose = initial_pose_from_given(given, body_model(FitSettings()), chosen)
     rig = pose.rig.to(dtype=torch.float32)
     return Motion(BodyFit(rig, tuple(chosen), pose.theta.float(), pose.root.float()), fps, "z")
 

@@ -48,7 +48,7 @@ def joints_m(body: BodyFit | Pose) -> Tensor:
 def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture, BodyFit]:
     """Record masks of the made-up person in the poses of `parameters()`, without keypoints but with the poses `given`,
     which may differ."""
-    pose = initial_pose_from_given(parameters(), body_model(FitSettings(body_model=model_file)))
+    pose = initial_pose_from_given(parameters(), body_model(FitSettings(body_model=model_file)), (0, 1, 2))
     truth = BodyFit(pose.rig.to(dtype=torch.float32), (0, 1, 2), pose.theta.float(), pose.root.float())
     capture = record(folder, truth, RING, tuple(RING))
     (folder / "keypoints.npz").unlink()
@@ -57,11 +57,12 @@ def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture
 
 
 def test_frames_without_a_given_pose_take_that_of_the_nearest_frame(model_file: Path) -> None:
+    """The unknown frame in the middle is one row away from both others, but nearer in time to the last one."""
     given = parameters()
-    given.theta[0], given.root[0] = np.nan, np.nan
-    pose = initial_pose_from_given(given, body_model(FitSettings(body_model=model_file)))
-    assert torch.equal(pose.theta[0], pose.theta[1]) and torch.equal(pose.root[0], pose.root[1])
-    assert not torch.equal(pose.theta[1], pose.theta[2])
+    given.theta[1], given.root[1] = np.nan, np.nan
+    pose = initial_pose_from_given(given, body_model(FitSettings(body_model=model_file)), (0, 8, 9))
+    assert torch.equal(pose.theta[1], pose.theta[2]) and torch.equal(pose.root[1], pose.root[2])
+    assert not torch.equal(pose.theta[0], pose.theta[2])
 
 
 def test_outlines_correct_given_poses_without_keypoints(model_file: Path, tmp_path: Path) -> None:
@@ -72,7 +73,7 @@ def test_outlines_correct_given_poses_without_keypoints(model_file: Path, tmp_pa
     wrong.theta[:, 17, 2] -= 0.15
     capture, truth = recorded(model_file, tmp_path, wrong)
     settings = FitSettings(body_model=model_file, contour_steps=4)
-    begin = initial_pose_from_given(wrong, body_model(settings))
+    begin = initial_pose_from_given(wrong, body_model(settings), (0, 1, 2))
     fit, report = fit_body(capture, silhouettes(capture, truth), settings)
     before, after = ((joints_m(body) - joints_m(truth))[:, truth.rig.free].norm(dim=-1) for body in (begin, fit))
     assert float(before.mean()) > 0.03 and float(after.mean()) < 0.008
@@ -102,7 +103,8 @@ def test_given_poses_are_transferred_to_anny_by_corresponding_joints(model_file:
     """Limbs start from the same hips and point in the same directions within a few degrees; the made-up T pose differs
     a little from the mean one."""
     smpl, anny = (
-        initial_pose_from_given(parameters(), body_model(FitSettings(body_model=m))) for m in (model_file, "anny")
+        initial_pose_from_given(parameters(), body_model(FitSettings(body_model=m)), (0, 1, 2))
+        for m in (model_file, "anny")
     )
     ways = []
     for pose in (smpl, anny):
