@@ -8,6 +8,7 @@ from hnerf.geometry.camera import Camera
 TORSO = (2, 5, 9, 12)  # shoulders and hips in BODY_25
 HEAD_AND_TORSO = (0, 1, 2, 5, 8, 9, 12, 15, 16, 17, 18)
 OUTLIER_ERROR_RATIO = 3.0  # of the error with a keypoint to that without it; 1.2 by chance
+MIN_BOX_PX = 4.0  # larger side of the box around keypoints; in a smaller one they are all on one spot
 MIN_WIDTH_M = 0.05  # root mean square distance of points from a line that determines the rotation about it
 
 
@@ -34,13 +35,13 @@ def root_from_space(rest_m: np.ndarray, points_m: np.ndarray) -> np.ndarray | No
 
 def root_from_image(camera: Camera, rest_m: np.ndarray, keypoints: np.ndarray) -> np.ndarray | None:
     """Return world from body (4, 4) from one view of head and torso. rest_m (25, 3): the rest body; keypoints (25, 3)
-    x_px, y_px, confidence; None with too few keypoints.
+    x_px, y_px, confidence; None with too few keypoints, or all of them on one spot.
 
-    SQPnP (Terzakis and Lourakis 2020), refined by Levenberg-Marquardt; one keypoint is left out if the others
-    contradict it.
+    SQPnP (Terzakis and Lourakis 2020) or, for a person so far away that it refuses, EPnP (Lepetit et al. 2009), refined
+    by Levenberg-Marquardt; one keypoint is left out if the others contradict it.
     """
     seen = [k for k in HEAD_AND_TORSO if keypoints[k, 2] > 0]
-    if len(seen) < 6:
+    if len(seen) < 6 or np.ptp(keypoints[seen, :2], axis=0).max() < MIN_BOX_PX:
         return None
     found, error_px = _pnp(camera, rest_m[seen], keypoints[seen, :2])
     if len(seen) > 6:
@@ -55,7 +56,10 @@ def root_from_image(camera: Camera, rest_m: np.ndarray, keypoints: np.ndarray) -
 def _pnp(camera: Camera, rest_m: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray | None, float]:
     """Solve for world from body (4, 4), None if there is no solution, and the root mean square distance in px between
     projected points (N, 3) and pixels (N, 2)."""
-    ok, rvec, tvec = cv2.solvePnP(rest_m, pixels, camera.K, None, flags=cv2.SOLVEPNP_SQPNP)
+    try:
+        ok, rvec, tvec = cv2.solvePnP(rest_m, pixels, camera.K, None, flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error:
+        ok, rvec, tvec = cv2.solvePnP(rest_m, pixels, camera.K, None, flags=cv2.SOLVEPNP_EPNP)
     if not ok:
         return None, np.inf
     rvec, tvec = cv2.solvePnPRefineLM(rest_m, pixels, camera.K, None, rvec, tvec)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import cv2
 import numpy as np
 
@@ -66,6 +68,18 @@ def test_one_image_determines_the_root_and_the_facing_direction() -> None:
         assert found is not None
         np.testing.assert_allclose(found, root, atol=1e-4)
     assert root_from_image(CAMERA, rest, np.zeros((25, 3))) is None
+
+
+def test_a_person_far_away_is_placed_and_keypoints_on_one_spot_are_not() -> None:
+    """At 180 m the rays to head and trunk are less than 0.003 apart: SQPnP refuses them, as it does a single spot."""
+    rest, root = rest_keypoints(), turned(0.3, 1.5)
+    K = np.array([[30000.0, 0, 255], [0, 30000, 255], [0, 0, 1]])
+    far = dataclasses.replace(CAMERA, K=K, t_m=np.array([0, 0, 180.0]))
+    pixels = far.project(rest @ root[:3, :3].T + root[:3, 3])[0]
+    found = root_from_image(far, rest, np.column_stack([pixels, np.ones(25)]))
+    assert found is not None
+    np.testing.assert_allclose(found, root, atol=1e-2)
+    assert root_from_image(CAMERA, rest, np.full((25, 3), 100.0)) is None
 
 
 def test_an_outlier_keypoint_does_not_change_the_root() -> None:
