@@ -68,9 +68,11 @@ def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
     """Measure the residuals of keypoints (C, frames, 25, 3) under at least two cameras."""
     flat = keypoints.reshape(len(cameras), -1, 3)
     points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
+    judged = (flat[..., 2] > 0) & np.isfinite(points_m).all(1)
     points_m = points_m.reshape(*keypoints.shape[1:3], 3)
-    off_px = max(float(np.hypot(*camera.size_px)) for camera in cameras)  # if no point is in front of the camera
-    found = {camera.name: row[np.isfinite(row)] for camera, row in zip(cameras, residuals_px, strict=True)}
+    off_px = max(float(np.hypot(*camera.size_px)) for camera in cameras)  # of a point behind a camera that sees it
+    off = np.where(np.isfinite(residuals_px), residuals_px, off_px)
+    found = {camera.name: row[use] for camera, row, use in zip(cameras, off, judged, strict=True)}
     return Measure(
         median_px={name: float(np.median(row)) if len(row) else off_px for name, row in found.items()},
         p95_px={name: float(np.percentile(row, 95)) if len(row) else off_px for name, row in found.items()},

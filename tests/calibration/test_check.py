@@ -154,6 +154,14 @@ def test_a_camera_with_bad_detections_is_suspect_or_rejected(tmp_path: Path, noi
     assert ("c2" in used.cameras) == ("c2" in used.train_cameras) == (status == "suspect")
 
 
+def test_a_camera_that_faces_away_is_rejected(tmp_path: Path) -> None:
+    """A few points are triangulated wrongly, in front of it and a few pixels from its keypoints. All others lie behind
+    it, and count as the diagonal of its image off."""
+    away = recorded_with(tmp_path, lambda camera: turned(camera, 180), only=0, noise_px=1)
+    verdict = check_calibration(away, SETTINGS).verdicts["c0"]
+    assert verdict.status == "rejected" and verdict.median_px == pytest.approx(1000 * np.sqrt(2))
+
+
 def test_cameras_with_any_name_are_read_back(tmp_path: Path) -> None:
     """Recordings may use any camera name, but OpenCV's own writer refuses brackets and spaces."""
     cameras = [dataclasses.replace(camera, name=f"Camera ({i})") for i, camera in enumerate(ring(4))]
