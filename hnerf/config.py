@@ -52,7 +52,7 @@ class SyntheticSettings(Section):
     size_px: int = Field(default=256, ge=16, le=4096)  # side of the square images
     train_cameras: int = Field(default=4, ge=1)  # on a ring, at equal angles
     test_cameras: int = Field(default=2, ge=0)  # each half-way between two training cameras
-    train_frames: int = Field(default=20, ge=1)
+    train_frames: int = Field(default=20, ge=1)  # the first ones
     novel_pose_frames: int = Field(default=6, ge=0)  # frames with new poses, not trained on
     fps: float = Field(default=10.0, ge=0.01, le=10_000)  # frame rate
 
@@ -142,8 +142,8 @@ class FastFieldSettings(FieldSettings):
     width: int = Field(default=64, ge=1)  # of the networks' layers
     pose_width: int = Field(default=0, ge=0)  # of the pose code; 0: chosen from the scene
     nodes: int = Field(default=0, ge=0)  # of each frame's deformation graph; 0: chosen from the scene
-    grid_learning_rate: float = Field(default=5e-2, gt=0)
-    network_learning_rate: float = Field(default=1e-2, gt=0)
+    grid_learning_rate: float = Field(default=5e-2, gt=0)  # of the features, at the start
+    network_learning_rate: float = Field(default=1e-2, gt=0)  # at the start
     deformation_learning_rate: float = Field(default=1e-3, ge=0)  # in metres; 0: frames do not deform the body
 
 
@@ -221,15 +221,15 @@ GeometryRoles = Literal["surface_leads", "print"]
 class LossSettings(Section):
     """Weights of the losses in hnerf/training/losses.py, and their constants."""
 
-    reconstruction: float = Field(default=1.0, ge=0)
-    mask: float = Field(default=1.0, ge=0)
-    blend: float = Field(default=0.1, ge=0)
-    geometry: float = Field(default=0.02, ge=0)
-    segmentation: float = Field(default=0.02, ge=0)
-    eikonal: float = Field(default=1e-6, ge=0)
-    residual: float = Field(default=5e-4, ge=0)
-    fit: float = Field(default=1.0, ge=0)
-    increment: float = Field(default=0.02, ge=0)
+    reconstruction: float = Field(default=1.0, ge=0)  # of the image's colours
+    mask: float = Field(default=1.0, ge=0)  # of the person's colours by the density in the box alone
+    blend: float = Field(default=0.1, ge=0)  # of colours whose opacity in the box is the SDF's
+    geometry: float = Field(default=0.02, ge=0)  # of density and SDF that disagree
+    segmentation: float = Field(default=0.02, ge=0)  # of the surface's outline against the masks
+    eikonal: float = Field(default=1e-6, ge=0)  # of gradients of the SDF whose length is not 1
+    residual: float = Field(default=5e-4, ge=0)  # of a surface inside the body's skin
+    fit: float = Field(default=1.0, ge=0)  # of the body's own outline against the masks
+    increment: float = Field(default=0.02, ge=0)  # of changes of poses and shape since the fit
     elastic: float = Field(default=0.0, ge=0)  # not in the paper: smooths the deformations of `fast` and Nerfies
     floor: float = Field(default=0.0, ge=0)  # per metre, not in the paper: keeps the surface above the ground
     fog: float = Field(default=0.0, ge=0)  # not in the paper: empties the box around the person
@@ -253,7 +253,7 @@ class TrainingSettings(Section):
     steps: int = Field(default=0, ge=0)  # 0: chosen from the scene
     seconds: float | None = Field(default=None, gt=0)  # time limit for the field's steps; null: none
     novel_pose_steps: int = Field(default=100, ge=0)  # to tune the poses of novel frames against the finished field
-    frames_per_step: int = Field(default=8, ge=1)
+    frames_per_step: int = Field(default=8, ge=1)  # whose rays make one step
     rays_per_frame: int = Field(default=192, ge=1)  # at frames_per_step frames; fewer frames share all rays
     pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0: keep the fitted poses and shape
     one_posture: bool | None = None  # one posture in all training frames; null: chosen from the scene
