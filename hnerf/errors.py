@@ -49,5 +49,8 @@ def printable(text: str) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """Return the last line of an error's message, or the name of its class if the message is empty."""
-    return str(error).splitlines()[-1] if str(error) else type(error).__name__
+    """Return the line of an error's message that says why: the first, or the first below a traceback; the name of the
+    error's class if the message is empty. Libraries' advice follows it."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    below = max((k for k, line in enumerate(lines, 1) if line.startswith(('  File "', "    "))), default=0)
+    return (lines[below:] or lines or [type(error).__name__])[0]

@@ -37,7 +37,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
         settings = inputs[-1]
         trained.append(settings)
         if settings.noise == 0:
-            raise RuntimeError("rank 0 ended with exit code 1\nTrainingError: the surface is empty")
+            raise RuntimeError('rank 0 ended with exit code 1\n  File "run.py"\nTrainingError: the surface is empty')
         if settings.losses.eikonal == 0:
             raise LostWorkerError("rank 0 was killed by SIGKILL")
         (tmp_path / "report.json").write_text('{"seconds": 61.7, "device": "abacus", "steps": 3}')

@@ -205,7 +205,9 @@ def test_until_flat_is_refused_if_no_image_can_be_scored(
 
 
 @pytest.mark.usefixtures("without_charts")
-@pytest.mark.parametrize("error", [RuntimeError("rank 0\nthe surface is empty"), InputError("the surface is empty")])
+@pytest.mark.parametrize(
+    "error", [RuntimeError('rank 0\n  File "run.py"\nthe surface is empty'), InputError("the surface is empty")]
+)
 def test_a_failed_method_holds_its_error_and_the_others_are_trained(
     stages: Stages, study: str, tmp_path: Path, error: Exception
 ) -> None:

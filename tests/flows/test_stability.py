@@ -56,7 +56,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
     def train(_: Any, recording: Any, cameras: Any, masks: Any, body: Any, settings: Any) -> Any:
         trained.append({"recording": recording.name, "masks": masks.name, "body": body.name, "settings": settings})
         if masks.name == "mask_eroded 1":
-            raise RuntimeError("rank 0 ended with exit code 1\nValueError: empty")
+            raise RuntimeError('rank 0 ended with exit code 1\n  File "run.py"\nValueError: empty')
         stored = {
             "static": recording.name == "frames_left 1",
             "training": {"field": {"kind": settings.field.kind}, "pose_learning_rate": 0},
