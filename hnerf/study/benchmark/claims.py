@@ -113,7 +113,8 @@ def no_trend_with_pose(result: Result) -> Iterator[Finding]:
         found = scatter_points(variant, "novel_pose", "pose_distance_deg")
         for points in [found[name] for name in _h_nerf(result, found)]:
             if len({x for x, _ in points}) > 2:
-                r = float(np.corrcoef(np.array(points).T)[0, 1])
+                equal = len({y for _, y in points}) == 1  # which has no correlation, and no trend
+                r = 0.0 if equal else float(np.corrcoef(np.array(points).T)[0, 1])
                 yield abs(r) < WEAK, f"{title}: correlation {r:+.2f} over {len(points)} images"
 
 

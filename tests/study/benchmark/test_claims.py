@@ -156,6 +156,15 @@ def test_scores_of_new_poses_have_no_trend_with_pose_distance(slope: float, seen
     assert verdict(synthetic_result("no_trend_with_pose", slope=slope)).startswith(seen)
 
 
+@pytest.mark.filterwarnings("error")
+def test_equal_scores_have_no_trend() -> None:
+    result = synthetic_result("no_trend_with_pose")
+    for variant in result["variants"].values():
+        for row in variant["methods"]["fast"]["novel_pose"]["per_image"]:
+            row["psnr"] = 30.1
+    assert verdict(result).startswith("yes: 4 cameras: correlation +0.00 over 4 images")
+
+
 def test_whether_other_methods_have_no_surface() -> None:
     assert (
         verdict(synthetic_result("others_have_no_surface"))
