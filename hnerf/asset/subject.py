@@ -15,6 +15,7 @@ from hnerf.files import atomic_folder
 from hnerf.render.motion import Motion, read_motion
 
 NEEDED = ("capture/capture.json", "calibration/intri.yml", "segmentation/report.json", "training/model.safetensors")
+LONGEST_NAME = 200  # of a motion; its payload's name is longer, and file systems take 255 bytes
 
 
 def export_subject(
@@ -41,7 +42,8 @@ def _named(motions: Iterable[Path]) -> dict[str, Motion]:
     for path in motions:
         called = path.resolve().name if path.is_dir() else path.stem  # a subject's name may have dots
         name = re.sub(r"\W+", "_", called, flags=re.ASCII).strip("_")
-        if not name or name in found or name.startswith(CAPTURED):
-            raise InputError(f"{path}: motion name {name!r} is empty, reserved or already in use; rename the file")
+        if not 0 < len(name) <= LONGEST_NAME or name in found or name.startswith(CAPTURED):
+            why = f"empty, longer than {LONGEST_NAME}, reserved or already in use"
+            raise InputError(f"{path}: motion name {name!r} is {why}; rename the file")
         found[name] = read_motion(path)
     return found
