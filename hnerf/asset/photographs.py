@@ -174,7 +174,9 @@ def visible_texels(
 
 def _depth(camera: Camera, surface: SeenSurface) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (H, W) at which each pixel's ray hits a surface, and where it jumps, (H, W) bool."""
-    at_px = camera.project(surface.vertices_m)[0]
+    at_px, ahead_m = camera.project(surface.vertices_m)
+    if not (ahead_m > 0).all():  # what reaches past the camera may show anywhere
+        at_px = np.array([(0, 0), camera.size_px])
     box_px = np.stack([np.floor(at_px.min(0)) - EDGE_PX, np.ceil(at_px.max(0)) + EDGE_PX + 1])
     lower, upper = box_px.clip(0, camera.size_px).astype(int)
     depth_m = np.full((camera.height_px, camera.width_px), FAR_M, np.float32)

@@ -101,6 +101,16 @@ def test_occluded_and_back_facing_squares_are_hidden() -> None:
     assert len(index) == 0
 
 
+def test_a_surface_that_reaches_past_the_camera_still_hides_what_is_behind_it() -> None:
+    """One corner of a third triangle lies beside the camera at depth 0, on the image's vertical axis: it has no
+    pixel."""
+    beside_m = np.array([[0, 5, -2], [0.1, 5, -1.9], [0, 5, -1.9]])
+    vertices_m = np.concatenate([square(0.4, 0.0), square(0.4, -0.3), beside_m])
+    faces = np.concatenate([FACES, FACES + 4, [[8, 9, 10]]])
+    index, _, _, _ = visible_texels(camera(), SeenSurface.of(vertices_m, faces), texels_at([0, 2], [MIDDLE, MIDDLE]))
+    assert index.tolist() == [1]
+
+
 def test_a_square_behind_the_camera_is_not_seen() -> None:
     """The square is 2 m behind the camera and faces it; it projects, mirrored, to the middle of the image."""
     behind = SeenSurface.of(square(0.4, -4.0), FACES[:, ::-1].copy())
