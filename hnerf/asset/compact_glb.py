@@ -12,6 +12,7 @@ from hnerf.evaluation.pictures import shrunk
 
 JPEG_QUALITY = 90
 TARGET_STEPS = {"POSITION": 2.0**-15, "NORMAL": 2.0**-7}  # 0.03 mm, and half a degree
+LIMITS = ("min", "max")
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
@@ -52,14 +53,15 @@ def as_glb(document: dict[str, Any], binary: bytes) -> bytes:
 
 
 def _steps_of_targets(document: dict[str, Any]) -> dict[int, float]:
-    """Return the rounding step of each morph target, by the buffer view of its values."""
+    """Return the rounding step of each morph target, by the buffer view of its values. Round its limits, too."""
     steps = {}
     for mesh in document["meshes"]:
         for primitive in mesh["primitives"]:
             for target in primitive.get("targets", []):
                 for name, index in target.items():
-                    accessor = document["accessors"][index]
-                    steps[accessor.get("sparse", {}).get("values", accessor)["bufferView"]] = TARGET_STEPS[name]
+                    accessor, step = document["accessors"][index], TARGET_STEPS[name]
+                    steps[accessor.get("sparse", {}).get("values", accessor)["bufferView"]] = step
+                    accessor |= {end: (np.round(np.divide(accessor[end], step)) * step).tolist() for end in LIMITS}
     return steps
 
 

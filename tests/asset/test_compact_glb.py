@@ -26,6 +26,8 @@ def test_compacting_changes_only_the_texture_and_blend_shapes(staged: StagedAvat
         old, new = accessor(before, index), accessor(after, index)
         np.testing.assert_allclose(new, old, atol=half, rtol=0)
         assert not half or not np.any(new % (2 * half))
+        if item := half and after.accessors[index]:
+            assert (item.min, item.max) == (new.min(0).tolist(), new.max(0).tolist())
     (mesh,) = trimesh.load_scene(tmp_path / "compact.glb").geometry.values()
     assert mesh.visual.material.baseColorTexture.size == (32, 32)
     assert (after.images[0].mimeType, before.images[0].mimeType) == ("image/jpeg", "image/png")
