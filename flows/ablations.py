@@ -15,7 +15,7 @@ from prefect import flow
 from flows.preparation import prepare_training, with_detections
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
-from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
+from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, title_of, with_changes
 from hnerf.errors import InputError, one_line
 from hnerf.files import replace_text
 from hnerf.study.benchmark import results
@@ -62,7 +62,7 @@ def ablate(
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(artifact_store, source, rows[FULL].capture).root).name
-    table = artifact_store.root / "ablations" / f"{subject}-{Path(preset).stem}{'-part' if only else ''}.md"
+    table = artifact_store.root / "ablations" / f"{subject}-{title_of(preset)}{'-part' if only else ''}.md"
     artifact_store.claim_table(table, source.digest, source.root)
     result: dict[str, Any] = {"subject": subject, "preset": preset, "overrides": overrides, "left_out": left_out}
     result["rows"] = {}

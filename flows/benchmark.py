@@ -11,7 +11,7 @@ from pydantic import Field
 from flows.preparation import Prepared, ingest_part, prepare_training
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
-from hnerf.config import Settings
+from hnerf.config import Settings, title_of
 from hnerf.errors import InputError, one_line
 from hnerf.evaluation.ground_truth import truth_of
 from hnerf.files import embed_images
@@ -65,7 +65,7 @@ def benchmark(
             f"{GROUND_TRUTH}/masks, or choose another study"
         )
     part = plan != whole.restricted_to([], None)
-    result, table = empty_result(plan, Path(study).stem, part, recorded), None
+    result, table = empty_result(plan, title_of(study), part, recorded), None
     artifact_store.claim_table(table_of(result, artifact_store.root), source.digest, source.root)
     for title, entry in result["variants"].items():
         variant = plan.variants[title]

@@ -15,7 +15,7 @@ from flows.preparation import Prepared, ingest_part, prepare_training
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
-from hnerf.config import Settings, load_settings
+from hnerf.config import Settings, load_settings, title_of
 from hnerf.errors import InputError, NotApplicableError, one_line
 from hnerf.evaluation.evaluate import reason_without_surface
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
@@ -76,7 +76,7 @@ def stability(
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest_part(artifact_store, source, plan.part, next(iter(presets.values()))).root).name
-    table = artifact_store.root / "stability" / f"{subject}-{Path(study).stem}{'' if plan == whole else '-part'}.md"
+    table = artifact_store.root / "stability" / f"{subject}-{title_of(study)}{'' if plan == whole else '-part'}.md"
     artifact_store.claim_table(table, source.digest, source.root)
     result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
     result |= {"left_out": plan.left_out(), "protocol": None, "runs": []}

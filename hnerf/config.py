@@ -4,6 +4,7 @@ A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seco
 """
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -415,6 +416,11 @@ def named_file(name: str, folder: Path, one: str, many: str, beside: Path = Path
                 return path
     known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
     raise InputError(f"{name[:80]}: no such {one} or file; {many} are {known}")
+
+
+def title_of(name: str) -> str:
+    """Return the title, for file names, of what `named_file` finds: the name, which may have dots, or the file's."""
+    return re.sub(r"\.ya?ml$", "", Path(name).name)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import torch
 from pydantic import ValidationError
 
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
-from hnerf.config import NerfSettings, Settings, SyntheticSettings, load_settings, validated, with_changes
+from hnerf.config import NerfSettings, Settings, SyntheticSettings, load_settings, title_of, validated, with_changes
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import load_study
 from hnerf.study.stability.plan import load_stability
@@ -210,6 +210,15 @@ def test_seeds_that_torch_does_not_accept_are_refused() -> None:
 def test_an_impossible_file_name_is_not_a_preset(name: str) -> None:
     with pytest.raises(InputError, match="no such preset or file"):
         load_settings(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [("x-0.5", "x-0.5"), ("a/x-0.5.yaml", "x-0.5"), ("x.yml", "x"), ("sub/fast", "fast")],
+)
+def test_titles_keep_dots(name: str, title: str) -> None:
+    """Otherwise the tables of presets x-0.5 and x-0.7 would be the same file."""
+    assert title_of(name) == title
 
 
 def test_synthetic_captures_have_frame_rates_that_the_reader_accepts() -> None:
