@@ -175,7 +175,8 @@ class Trainer:
         self._set_poses(self.scene.bodies)
 
     def _average_over_frames(self) -> None:
-        """Apply what the training frames have in common to all poses; with one posture this is the posture itself."""
+        """Apply what the training frames have in common to all poses. What changes in the pose of a single frame, or in
+        a posture that all of them share, stays there."""
         self.field.average_over_frames(self.train_rows)
         if self.field.common_rest and not self.settings.one_posture and len(self.train_rows) > 1:
             share_rest(self.scene.bodies, self.body, self.train_rows)
