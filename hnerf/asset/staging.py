@@ -145,7 +145,7 @@ def stage_avatar(
         rigs=rigs,
         frames=np.array(clothed.frames),
         points_m=points_m,
-        extents_m={name: _boxes(rigs[FULL], name, rest) for name in motions},
+        extents_m={name: _boxes(rigs, name, rest) for name in motions},
         texture=texture,
         stage_from_world=world,
         albedo=None if albedo is None else Albedo(albedo.texture, albedo.light.turned(world)),
@@ -204,7 +204,8 @@ def _motions(
     return motions
 
 
-def _boxes(rig: StagedRig, motion: str, rest: RestSurface) -> np.ndarray:
-    """Return the box (2, 3) of the surface at each time code of a motion, (n, 2, 3)."""
-    surfaces_m = tracked(rig.surfaces_m(motion, rest), f"boxes of {motion}", len(rig.stage[motion]))
-    return np.stack([box(points_m) for points_m in surfaces_m])
+def _boxes(rigs: Mapping[str, StagedRig], motion: str, rest: RestSurface) -> np.ndarray:
+    """Return the box (2, 3) of the surface at each time code of a motion, (n, 2, 3), whichever rig moves it."""
+    surfaces_m = zip(*(rig.surfaces_m(motion, rest) for rig in rigs.values()), strict=True)
+    count = len(rigs[FULL].motions[motion].codes)
+    return np.stack([box(np.concatenate(both_m)) for both_m in tracked(surfaces_m, f"boxes of {motion}", count)])

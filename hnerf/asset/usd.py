@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.levels import Level
 from hnerf.asset.quads import polygon_corners
-from hnerf.asset.rigs import StagedRig
+from hnerf.asset.rigs import FULL, StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import REST_POSE, StagedAvatar, box, moved_points, opengl_pose, shape_names
@@ -167,6 +167,10 @@ def author_motion(stage: Usd.Stage, name: str, avatar: StagedAvatar) -> None:
     """Define a motion for every rig, and the body's extents in it, at the same instants in the stage's time codes."""
     UsdGeom.Scope.Define(stage, MOTION)
     boxes = UsdGeom.Boundable(stage.OverridePrim(BODY)).CreateExtentAttr()
+    full = avatar.rigs[FULL].motions[name]
+    codes = full.codes * (stage.GetTimeCodesPerSecond() / full.fps)
+    for box_m, code in zip(avatar.extents_m[name], codes, strict=True):
+        boxes.Set(vec3f(box_m), code)
     for rig_name, rig in avatar.rigs.items():
         motion = rig.motions[name]
         joints = joint_paths(rig.skeleton)
@@ -176,12 +180,11 @@ def author_motion(stage: Usd.Stage, name: str, avatar: StagedAvatar) -> None:
         animation.CreateBlendShapesAttr(shape_names(avatar))
         translations, rotations = animation.CreateTranslationsAttr(), animation.CreateRotationsAttr()
         weights = animation.CreateBlendShapeWeightsAttr()
-        for k, code in enumerate(motion.codes * (stage.GetTimeCodesPerSecond() / motion.fps)):
+        for k, code in enumerate(codes):
             translations.Set(vec3f(motion.translations_m[k]), code)
             quaternions = [Gf.Quatf(w, x, y, z) for x, y, z, w in motion.quaternions[k].tolist()]
             rotations.Set(Vt.QuatfArray(quaternions), code)
             weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(motion.shape_weights[k], np.float32)), code)
-            boxes.Set(vec3f(avatar.extents_m[name][k]), code)
 
 
 def author_cameras(stage: Usd.Stage, cameras: Iterable[Camera], stage_from_world: np.ndarray) -> None:

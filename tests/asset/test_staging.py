@@ -1,11 +1,15 @@
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from hnerf.asset import staging
 from hnerf.asset.correctives import correctives_of
 from hnerf.asset.levels import Level
+from hnerf.asset.rigs import StagedRig, stage_rigs
+from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import StagedAvatar, moved_points, stage_avatar, stage_from_world
 from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
@@ -100,6 +104,22 @@ def test_progress_is_reported_while_bounding_boxes_are_computed() -> None:
         staged = staged_without_shapes(bending_body())
     counts = {name: len(boxes_m) for name, boxes_m in staged.extents_m.items()}
     assert heard == [(f"boxes of {name}", done, count) for name, count in counts.items() for done in range(count + 1)]
+
+
+def test_bounding_boxes_contain_the_surface_in_both_rigs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here all points of the game rig follow the pelvis, so that the column stays upright where the full one bends."""
+
+    def with_stiff_game_rig(*arguments: Any) -> dict[str, StagedRig]:
+        rigs = stage_rigs(*arguments)
+        stiff = Skin(np.ones_like(rigs["game"].skin.joints), rigs["game"].skin.weights)
+        return rigs | {"game": dataclasses.replace(rigs["game"], skin=stiff)}
+
+    monkeypatch.setattr(staging, "stage_rigs", with_stiff_game_rig)
+    staged = staged_without_shapes(bending_body())
+    boxes_m = staged.extents_m["captured"]
+    for rig in staged.rigs.values():
+        surfaces_m = np.stack(list(rig.surfaces_m("captured", staged.rest)))
+        assert (boxes_m[:, :1] <= surfaces_m).all() and (surfaces_m <= boxes_m[:, 1:]).all()
 
 
 def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:
