@@ -12,7 +12,7 @@ from tasks.store import Artifact
 from tasks.training import load_trained_avatar
 
 
-@stage("asset", version="27", networks=tuple(THREE_SHA256))
+@stage("asset", version="28", networks=tuple(THREE_SHA256))
 def export(
     out: Path,
     recording: Artifact,

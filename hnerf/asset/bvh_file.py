@@ -17,7 +17,7 @@ def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
     """Write the captured motion of the game skeleton, from the pelvis down, at 30 frames per second, in centimetres, Y
     up."""
     rig = avatar.rigs[GAME]
-    skeleton, stage = rig.skeleton, rig.stage[f"{CAPTURED}_{RATE}"][:, 1:]
+    skeleton, stage = rig.skeleton, rig.stage(f"{CAPTURED}_{RATE}")[:, 1:]
     # Relative to rest, where BVH's joints have no rotation.
     turned = stage[..., :3, :3] @ skeleton.rotations[1:].swapaxes(1, 2)
     parents = skeleton.parents[1:] - 1

@@ -66,7 +66,7 @@ def splat_figures(staged: StagedAvatar, splats: Splats) -> dict[str, float]:
     captured surfaces, as in `rig_figures`."""
     game, full = staged.rigs[GAME], staged.rigs[FULL]
     skin, weights = splats.skin(game), game.motions[CAPTURED].shape_weights
-    poses = posed_frames(game.skeleton, game.stage[CAPTURED], staged.rest, weights)
+    poses = posed_frames(game.skeleton, game.stage(CAPTURED), staged.rest, weights)
     off_m = (
         skinned(transforms, skin, splats.at(points_m)) - splats.at(surface_m)
         for (transforms, points_m), surface_m in zip(poses, full.surfaces_m(CAPTURED, staged.rest), strict=True)

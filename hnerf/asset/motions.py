@@ -32,12 +32,14 @@ class Motion:
         """Return the instants, (n,)."""
         return self.codes / self.fps
 
-    def transforms(self, parents: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
-        """Return the joints' transforms in the stage, (n, S, 4, 4), for a body at rest at positions_m (S, 3)."""
-        found = np.tile(np.eye(4), (len(self.codes), len(parents), 1, 1))
-        found[:, 0, :3, :3], found[:, 0, :3, 3] = self.turns[:, 0], self.origins_m
+    def transforms(self, parents: np.ndarray, positions_m: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        """Return the joints' transforms in the stage at some rows of the instants, (n, S, 4, 4), for a body at rest at
+        positions_m (S, 3)."""
+        turns = self.turns[rows]
+        found = np.tile(np.eye(4), (len(turns), len(parents), 1, 1))
+        found[:, 0, :3, :3], found[:, 0, :3, 3] = turns[:, 0], self.origins_m[rows]
         for j, parent in enumerate(parents[1:], 1):
-            found[:, j, :3, :3] = found[:, parent, :3, :3] @ self.turns[:, j]
+            found[:, j, :3, :3] = found[:, parent, :3, :3] @ turns[:, j]
             moved_m = found[:, parent, :3, :3] @ (positions_m[j] - positions_m[parent])
             found[:, j, :3, 3] = found[:, parent, :3, 3] + moved_m
         return found
@@ -96,10 +98,9 @@ def ground_transforms(pelvis: np.ndarray, floor_m: float) -> np.ndarray:
     return ground
 
 
-def continuous_quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Convert rotations (n, J, 3, 3) to quaternions (n, J, 4) as x y z w, each in the same hemisphere as in the
-    previous frame."""
-    quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
+def continuous_quaternions(quaternions: np.ndarray) -> np.ndarray:
+    """Return quaternions (n, J, 4), each with the sign that puts it in the same hemisphere as in the previous frame."""
+    quaternions = quaternions.copy()
     same_side = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) >= 0
     quaternions[1:] *= np.cumprod(np.where(same_side, 1, -1), axis=0)
     return quaternions

@@ -1,9 +1,10 @@
 """The rigs of an exported avatar, "full" and "game", with all its motions."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hnerf.asset.motions import Motion, continuous_quaternions, ground_transforms
 from hnerf.asset.skeleton import Bones, Skeleton, full_skeleton, game_skeleton
@@ -14,6 +15,7 @@ from hnerf.evenly_spaced import evenly_spaced
 FULL, GAME = "full", "game"
 GAME_INFLUENCES = 4
 EYEBALL_WEIGHT = 0.99  # least weight of a point on an eyeball
+BLOCK = 1024  # poses whose matrices are in memory at once; of half an hour at 120 a second, they would take 16 GB
 FITTED_FRAMES = 64  # at most, evenly spaced; more hardly change the weights
 
 
@@ -44,29 +46,35 @@ class JointMotion:
 
 @dataclass(frozen=True)
 class StagedRig:
-    """A skeleton, the skin that follows it, and its motions by name. stage (n, J, 4, 4), by motion: the joints'
-    transforms in the stage."""
+    """A skeleton, the skin that follows it, and its motions by name."""
 
     skeleton: Skeleton
     skin: Skin
     motions: dict[str, JointMotion]
-    stage: dict[str, np.ndarray]
+
+    def stage(self, motion: str, rows: Sequence[int] | slice = slice(None)) -> np.ndarray:
+        """Return the joints' transforms in the stage (n, J, 4, 4) at each time code of a motion, or only at some rows
+        of them."""
+        moving = self.motions[motion]
+        return self.skeleton.placed(moving.translations_m[rows], moving.quaternions[rows])
 
     def surfaces_m(
         self, motion: str, rest: RestSurface, rows: Sequence[int] | slice = slice(None)
     ) -> Iterator[np.ndarray]:
         """Yield the surface (V, 3) at each time code of a motion, or only at some rows of them: with blend shapes, then
         skinned."""
-        weights = self.motions[motion].shape_weights[rows]
-        for transforms, points_m in posed_frames(self.skeleton, self.stage[motion][rows], rest, weights):
+        weights = self.motions[motion].shape_weights
+        chosen = np.arange(len(weights))[rows]
+        stage = (self.stage(motion, [row])[0] for row in chosen)  # all at once would take 13 KB a frame
+        for transforms, points_m in posed_frames(self.skeleton, stage, rest, weights[chosen]):
             yield skinned(transforms, self.skin, points_m)
 
 
 def posed_frames(
-    skeleton: Skeleton, stage: np.ndarray, rest: RestSurface, shape_weights: np.ndarray
+    skeleton: Skeleton, stage: Iterable[np.ndarray], rest: RestSurface, shape_weights: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the joints' transforms from rest to stage (J, 4, 4) and the points at rest (V, 3) with blend shapes. stage
-    (n, J, 4, 4): the joints in the stage."""
+    """Yield the joints' transforms from rest to stage (J, 4, 4) and the points at rest (V, 3) with blend shapes. stage:
+    the joints in the stage, (J, 4, 4) each."""
     inverse = np.linalg.inv(skeleton.bind)
     for transforms, weights in zip(stage, shape_weights, strict=True):
         yield transforms @ inverse, rest.shaped(weights)
@@ -81,10 +89,9 @@ def stage_rigs(
     skin = without_lids(Skin(rig.skin_joints.numpy(), rig.skin_weights.double().numpy()), rig.joint_names, parents)
     full = full_skeleton(rig.joint_names, parents, joints_m, bones)
     skin = Skin(np.where(skin.weights > 0, skin.joints + 1, 0), skin.weights)  # a root joint was added before them
-    poses = {name: motion.transforms(parents, joints_m) for name, motion in motions.items()}
     game, taken_by = game_skeleton(full, bones)
     staged = {
-        name: StagedRig(skeleton, found, *_motions(skeleton, motions, poses, floor_m))
+        name: StagedRig(skeleton, found, _motions(skeleton, motions, parents, joints_m, floor_m))
         for name, skeleton, found in ((FULL, full, skin), (GAME, game, skin.moved_to(taken_by)))
     }
     staged[GAME] = _with_game_skin(staged[GAME], next(iter(motions)), rest)
@@ -105,21 +112,27 @@ def without_lids(skin: Skin, joints: tuple[str, ...], parents: np.ndarray) -> Sk
 
 
 def _motions(
-    skeleton: Skeleton, motions: dict[str, Motion], poses: dict[str, np.ndarray], floor_m: float
-) -> tuple[dict[str, JointMotion], dict[str, np.ndarray]]:
-    moving, stage = {}, {}
+    skeleton: Skeleton, motions: dict[str, Motion], parents: np.ndarray, joints_m: np.ndarray, floor_m: float
+) -> dict[str, JointMotion]:
+    """Return the skeleton's motions. parents (S,), joints_m (S, 3): of the body model, at rest."""
+    moving = {}
     for name, motion in motions.items():
-        stage[name] = skeleton.posed(poses[name], ground_transforms(poses[name][:, 0], floor_m))
-        local = skeleton.local(stage[name])
-        quaternions = continuous_quaternions(local[..., :3, :3])
-        translations_m = local[..., :3, 3].copy()  # a view would keep the matrices
-        moving[name] = JointMotion(motion.fps, motion.codes, translations_m, quaternions, motion.shape_weights)
-    return moving, stage
+        ground = ground_transforms(motion.transforms(parents[:1], joints_m[:1])[:, 0], floor_m)
+        translations_m, quaternions = [], []
+        for start in range(0, len(ground), BLOCK):
+            rows = slice(start, start + BLOCK)
+            local = skeleton.local(skeleton.posed(motion.transforms(parents, joints_m, rows), ground[rows]))
+            turns = Rotation.from_matrix(local[..., :3, :3].reshape(-1, 3, 3))
+            translations_m.append(local[..., :3, 3].copy())  # a view would keep the matrices
+            quaternions.append(turns.as_quat().reshape(*local.shape[:2], 4))
+        moves_m, turning = np.concatenate(translations_m), continuous_quaternions(np.concatenate(quaternions))
+        moving[name] = JointMotion(motion.fps, motion.codes, moves_m, turning, motion.shape_weights)
+    return moving
 
 
 def _with_game_skin(game: StagedRig, captured: str, rest: RestSurface) -> StagedRig:
     """Return the rig with few influences per point, chosen so that the captured surfaces change least."""
-    chosen = evenly_spaced(range(len(game.stage[captured])), FITTED_FRAMES)
+    chosen = evenly_spaced(range(len(game.motions[captured].codes)), FITTED_FRAMES)
     weights = game.motions[captured].shape_weights[chosen]
-    poses = posed_frames(game.skeleton, game.stage[captured][chosen], rest, weights)
-    return StagedRig(game.skeleton, with_few_influences(game.skin, poses, GAME_INFLUENCES), game.motions, game.stage)
+    poses = posed_frames(game.skeleton, game.stage(captured, chosen), rest, weights)
+    return StagedRig(game.skeleton, with_few_influences(game.skin, poses, GAME_INFLUENCES), game.motions)

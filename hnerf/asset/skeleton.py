@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hnerf.body.skeletons import ROOT, exported_name, is_serial
 
@@ -39,6 +40,17 @@ class Skeleton:
         """Return transforms (..., J, 4, 4) of joints in the stage relative to their parents; the root's are kept."""
         found = transforms.copy()
         found[..., 1:, :, :] = np.linalg.inv(transforms[..., self.parents[1:], :, :]) @ transforms[..., 1:, :, :]
+        return found
+
+    def placed(self, translations_m: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
+        """Return the joints' transforms (n, J, 4, 4) in the stage. translations_m (n, J, 3), quaternions (n, J, 4) as
+        x y z w: of their transforms relative to their parents, as `local` returns them."""
+        found = np.tile(np.eye(4), (*quaternions.shape[:2], 1, 1))
+        turns = Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix()
+        found[..., :3, :3] = turns.reshape(*quaternions.shape[:2], 3, 3)
+        found[..., :3, 3] = translations_m
+        for j, parent in enumerate(self.parents[1:], 1):
+            found[:, j] = found[:, parent] @ found[:, j]
         return found
 
     def posed(self, turned: np.ndarray, ground: np.ndarray) -> np.ndarray:

@@ -16,9 +16,14 @@ def with_axes(staged: StagedAvatar, axes: np.ndarray) -> StagedAvatar:
     game, turn = staged.rigs["game"], np.eye(4)
     turn[:3, :3] = axes
     skeleton = dataclasses.replace(game.skeleton, rotations=game.skeleton.rotations @ axes)
-    stage = {name: joints @ turn for name, joints in game.stage.items()}
+    motions = {}
+    for name, motion in game.motions.items():
+        local = skeleton.local(game.stage(name) @ turn)
+        quaternions = Rotation.from_matrix(local[..., :3, :3].reshape(-1, 3, 3)).as_quat()
+        quaternions = quaternions.reshape(motion.quaternions.shape)
+        motions[name] = dataclasses.replace(motion, translations_m=local[..., :3, 3], quaternions=quaternions)
     return dataclasses.replace(
-        staged, rigs=staged.rigs | {"game": dataclasses.replace(game, skeleton=skeleton, stage=stage)}
+        staged, rigs=staged.rigs | {"game": dataclasses.replace(game, skeleton=skeleton, motions=motions)}
     )
 
 

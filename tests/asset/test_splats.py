@@ -136,7 +136,7 @@ def test_ply_skinning_matches_the_game_rigs_surface(staged: StagedAvatar, splats
     assert (names[joints[y < 0.6, 0]] == "pelvis").all() and (names[joints[y > 1.1, 0]] == "upper_L").all()
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
     at_rest_m = np.stack([found[axis] for axis in "xyz"], 1).astype(float)
-    transforms = rig.stage[CAPTURED][2] @ np.linalg.inv(rig.skeleton.bind)
+    transforms = rig.stage(CAPTURED)[2] @ np.linalg.inv(rig.skeleton.bind)
     blended = np.einsum("nk,nkab->nab", weights, transforms[joints])
     moved_m = np.einsum("nab,nb->na", blended[:, :3, :3], at_rest_m) + blended[:, :3, 3]
     surface_m = splats.at(skinned(transforms, rig.skin, staged.rest_points_m))

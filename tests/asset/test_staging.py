@@ -1,14 +1,16 @@
 import dataclasses
+import tracemalloc
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from hnerf.asset import staging
+from hnerf.asset import rigs, staging
 from hnerf.asset.correctives import correctives_of
 from hnerf.asset.levels import Level
-from hnerf.asset.rigs import StagedRig, stage_rigs
+from hnerf.asset.motions import Motion
+from hnerf.asset.rigs import RestSurface, StagedRig, stage_rigs
 from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import StagedAvatar, moved_points, stage_avatar, stage_from_world
 from hnerf.asset.texture import UvLayout
@@ -78,6 +80,29 @@ def test_translations_do_not_keep_the_joints_matrices(staged: StagedAvatar) -> N
     assert all(motion.translations_m.base is None for motion in staged.rigs["full"].motions.values())
 
 
+def test_blocks_of_a_motion_are_one_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = staged_without_shapes(bending_body())
+    monkeypatch.setattr(rigs, "BLOCK", 3)
+    for name, rig in staged_without_shapes(bending_body()).rigs.items():
+        for motion, moving in rig.motions.items():
+            expected = whole.rigs[name].motions[motion]
+            np.testing.assert_array_equal(moving.translations_m, expected.translations_m)
+            np.testing.assert_array_equal(moving.quaternions, expected.quaternions)
+
+
+def test_a_long_motion_does_not_fill_the_memory() -> None:
+    """The matrices of two joints, and of three in either rig, would take 1 KB a pose."""
+    rig, poses = column_rig(), 20_000
+    places = np.zeros((poses, 3)), np.zeros((poses, 0))
+    motion = Motion(30.0, np.arange(float(poses)), np.tile(np.eye(3), (poses, 2, 1, 1)), *places)
+    rest = RestSurface(rig.vertices_m.numpy(), np.zeros((0, *rig.vertices_m.shape)))
+    tracemalloc.start()
+    stage_rigs(rig, np.array([[0.0, 0, 0], [0, 0.8, 0]]), rest, {"captured": motion}, 0.0, "along")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak / poses < 1000
+
+
 def test_other_frame_rates_resample_the_motion_at_whole_frames(staged: StagedAvatar) -> None:
     """Frames 3 to 8 at 10 a second run from 0.3 to 0.8 s: codes 8 to 19 at 24 a second, and 9 to 24 at 30, which
     include every captured frame."""
@@ -110,9 +135,9 @@ def test_bounding_boxes_contain_the_surface_in_both_rigs(monkeypatch: pytest.Mon
     """Here all points of the game rig follow the pelvis, so that the column stays upright where the full one bends."""
 
     def with_stiff_game_rig(*arguments: Any) -> dict[str, StagedRig]:
-        rigs = stage_rigs(*arguments)
-        stiff = Skin(np.ones_like(rigs["game"].skin.joints), rigs["game"].skin.weights)
-        return rigs | {"game": dataclasses.replace(rigs["game"], skin=stiff)}
+        staged = stage_rigs(*arguments)
+        stiff = Skin(np.ones_like(staged["game"].skin.joints), staged["game"].skin.weights)
+        return staged | {"game": dataclasses.replace(staged["game"], skin=stiff)}
 
     monkeypatch.setattr(staging, "stage_rigs", with_stiff_game_rig)
     staged = staged_without_shapes(bending_body())
