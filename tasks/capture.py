@@ -12,7 +12,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("capture", version="18")
+@stage("capture", version="19")
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
     """Read a recording in any supported layout; undistort and normalise it."""
     run_caged(ingest_folder, source.root, settings, out, folder=source.root)

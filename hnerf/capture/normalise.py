@@ -96,8 +96,16 @@ class Normaliser:
 
 
 def has_soft_edges(mask: np.ndarray, source: Path) -> bool:
-    """Return whether a mask (H, W) uint8 from file `source` is a matte, or comes from a JPEG, whose edges ring."""
-    return source.suffix.lower() in (".jpg", ".jpeg") or len(np.unique(mask)) > MAX_LABELS
+    """Return whether a mask (H, W) uint8 from file `source` is a matte, comes from a JPEG, whose edges ring, or is
+    antialiased: mostly white, and grey along lines rather than in the areas that labels fill."""
+    pixels = np.bincount(mask.ravel(), minlength=256)
+    if source.suffix.lower() in (".jpg", ".jpeg") or np.count_nonzero(pixels) > MAX_LABELS:
+        return True
+    if not 0 < pixels[1:255].sum() < pixels[255]:
+        return False
+    grey = ((mask > 0) & (mask < 255)).astype(np.uint8)
+    areas = cv2.morphologyEx(grey, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return bool(2 * np.count_nonzero(areas) < np.count_nonzero(grey))
 
 
 def kept_share(lens: Lens, size_px: tuple[int, int]) -> float:

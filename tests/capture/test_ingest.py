@@ -187,6 +187,24 @@ def test_mattes_are_thresholded_in_the_middle_but_labels_at_zero(folder: Path, t
         assert hard is not None and np.array_equal(hard, labels[..., 0] > 0)
 
 
+def test_antialiased_masks_do_not_grow(folder: Path, tmp_path: Path) -> None:
+    """Camera 01: the person covers a quarter of the pixels at the left edge, three quarters of those at the right edge.
+    Camera 02 has two parts of the person, drawn as 100 and 255."""
+    covered = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
+    parts = covered.copy()
+    covered[3:13, 5:19], parts[3:13, 5:19] = 255, 255
+    covered[3:13, 4], covered[3:13, 19] = 64, 191
+    parts[9:13, 5:19] = 100
+    for frame in rec.FRAMES:
+        write_image(folder / "masks" / "01" / f"{frame:06d}.png", covered)
+        write_image(folder / "masks" / "02" / f"{frame:06d}.png", parts)
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    for frame in rec.FRAMES:
+        soft, hard = (capture.given_mask(camera, frame) for camera in rec.CAMERAS)
+        assert soft is not None and np.array_equal(soft, covered[..., 0] > 127)
+        assert hard is not None and np.array_equal(hard, parts[..., 0] > 0)
+
+
 def test_a_distorted_recording_is_undistorted(folder: Path, tmp_path: Path) -> None:
     """k1 = -0.5: what the lens shows at radius r (1 - 0.5 r^2) belongs at radius r."""
     rec.write_calibration(folder, distortion=(-0.5, 0, 0, 0))
