@@ -117,6 +117,16 @@ class _Array(_StandIn):
         return flat.reshape(shape, order="F" if column_major else "C")
 
 
+class _Buffer(_StandIn):
+    """A numpy._core.numeric._frombuffer(bytes, dtype, shape, order, axes), an array in protocol 5; axes of order K."""
+
+    def plain(self, done: dict[int, Any]) -> Any:
+        data, dtype, shape, order, *axes = self.arguments
+        array = _Array()
+        array.state = (1, shape, dtype, order == "F", data)
+        return array.plain(done).transpose(axes[0]) if order == "K" else array.plain(done)
+
+
 class _Scalar(_StandIn):
     """A numpy.core.multiarray.scalar(dtype, bytes)."""
 
@@ -187,14 +197,15 @@ def _with_keys(code: bytes, keys: slice) -> Callable[[Any], None]:
 
 
 def _refused(unpickler: Any) -> None:
-    """Refuse an opcode that allocates as much as a pickle says, or that hashes its contents."""
-    raise pickle.UnpicklingError("it holds a set or a bytearray")
+    """Refuse an opcode that hashes its contents."""
+    raise pickle.UnpicklingError("it holds a set")
 
 
 _ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "dtype"): _Dtype,
     ("numpy", "ndarray"): _Array,
     ("_codecs", "encode"): _encoded,
+    ("__builtin__", "bytes"): lambda: b"",  # without arguments, as Python 3 writes empty bytes for Python 2
     ("copy_reg", "_reconstructor"): _reconstructed,
     ("copyreg", "_reconstructor"): _reconstructed,
     ("__builtin__", "object"): object,
@@ -203,6 +214,7 @@ _ALLOWED: dict[tuple[str, str], Any] = {
     ("builtins", "set"): _unhashed,
     ("chumpy.ch", "Ch"): _Chumpy,
     **{(module, "_reconstruct"): _reconstructed for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
+    **{(module, "_frombuffer"): _Buffer for module in ("numpy.core.numeric", "numpy._core.numeric")},
     **{(module, "scalar"): _Scalar for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
     **{(f"scipy.sparse.{module}", "csc_matrix"): _Sparse for module in ("csc", "_csc")},
 }
@@ -211,7 +223,9 @@ _ALLOWED: dict[tuple[str, str], Any] = {
 class _Unpickler(pickle._Unpickler):  # the Python version: the one in C allocates as much as a pickle's memo index says
     dispatch: ClassVar = {
         **pickle._Unpickler.dispatch,
-        **{code[0]: _refused for code in (pickle.BYTEARRAY8, pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET)},
+        **{code[0]: _refused for code in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET)},
+        # The handler of its own allocates as much as a pickle says.
+        pickle.BYTEARRAY8[0]: pickle._Unpickler.dispatch[pickle.BINBYTES8[0]],
         pickle.SETITEM[0]: _with_keys(pickle.SETITEM, slice(-2, -1)),
         pickle.SETITEMS[0]: _with_keys(pickle.SETITEMS, slice(0, None, 2)),
         pickle.DICT[0]: _with_keys(pickle.DICT, slice(0, None, 2)),
