@@ -21,13 +21,14 @@ def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float
     """Return the person's stature H if they stand on height 0: the median over frames; NaN if never seen.
 
     The standing foot is where a ray to a toe or heel meets height 0 closest to the camera: rays to a lifted foot meet
-    it farther away. If no toe or heel is ever seen, ankles replace them, ANKLE_SHARE of H higher. If the ray to the
-    nose falls r times as steeply as the one to the foot, a camera at height c sees the nose at c - r (c - ANKLE_SHARE
-    H), which is NOSE_SHARE H. keypoints (frames, 25, 3).
+    it farther away. If toes and heels are seen in at most half as many frames as ankles, ankles replace them,
+    ANKLE_SHARE of H higher. If the ray to the nose falls r times as steeply as the one to the foot, a camera at height
+    c sees the nose at c - r (c - ANKLE_SHARE H), which is NOSE_SHARE H. keypoints (frames, 25, 3).
     """
     vertical = "xyz".index(up)
     origin = camera.centre_m
-    feet, share = (SOLES, 0.0) if (keypoints[:, SOLES, 2] > 0).any() else (ANKLES, ANKLE_SHARE)
+    by_soles, by_ankles = (int((keypoints[:, points, 2] > 0).any(1).sum()) for points in (SOLES, ANKLES))
+    feet, share = (SOLES, 0.0) if 2 * by_soles > by_ankles else (ANKLES, ANKLE_SHARE)
     _, soles = camera.rays(keypoints[:, feet, :2])
     with np.errstate(divide="ignore", invalid="ignore"):
         far_m = -origin[vertical] / soles[..., vertical]

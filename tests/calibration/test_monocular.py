@@ -54,6 +54,9 @@ def test_ankles_give_the_stature_if_no_foot_is_seen() -> None:
     seen[0, [0, 11, 14]] = np.column_stack([camera.project(points_m)[0], np.ones(3)])
     assert stature_on_ground_m(camera, seen, "z") == pytest.approx(2.0, rel=2e-3)  # ankles are a little to the side
     assert raised_above_ground(camera, seen, "z", 2.0) == (camera, "")
+    thrice = np.repeat(seen, 3, 0)
+    thrice[0, 19] = [*camera.project(np.array([[0, 0, 0.5]]))[0][0], 0.3]  # a toe where the knee is
+    assert stature_on_ground_m(camera, thrice, "z") == pytest.approx(2.0, rel=2e-3)
 
 
 def test_a_known_stature_decides_whether_height_0_is_the_ground() -> None:
