@@ -8,7 +8,7 @@ import dataclasses
 import logging
 from collections.abc import Sequence
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -153,14 +153,21 @@ def _add_cameras(
 
 def _resection(camera: Camera, points_m: np.ndarray, keypoints: np.ndarray, inlier_px: float) -> tuple[Camera, int]:
     """Return the camera posed against known points (K, 3) that it sees at keypoints (K, 3), and how many fit (SQPnP,
-    Terzakis and Lourakis 2020, in RANSAC)."""
+    Terzakis and Lourakis 2020, or, for a person so far away that it refuses, EPnP, in RANSAC)."""
     use = (keypoints[:, 2] > 0) & np.isfinite(points_m).all(-1)
     if use.sum() < MIN_SHARED // 2:
         return camera, 0
-    ok, turn, shift, inliers = cv2.solvePnPRansac(
-        points_m[use], keypoints[use, :2], camera.K, None, iterationsCount=TRIALS,
-        reprojectionError=2 * inlier_px, flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
+
+    def solve(method: int) -> Any:
+        return cv2.solvePnPRansac(
+            points_m[use], keypoints[use, :2], camera.K, None, iterationsCount=TRIALS,
+            reprojectionError=2 * inlier_px, flags=method,
+        )  # fmt: skip
+
+    try:
+        ok, turn, shift, inliers = solve(cv2.SOLVEPNP_SQPNP)
+    except cv2.error:
+        ok, turn, shift, inliers = solve(cv2.SOLVEPNP_EPNP)
     if not ok or inliers is None:
         return camera, 0
     return dataclasses.replace(camera, R=cv2.Rodrigues(turn)[0], t_m=shift.ravel()), len(inliers)

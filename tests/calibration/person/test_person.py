@@ -50,6 +50,16 @@ def test_a_rig_is_found_without_poses() -> None:
     assert turn_deg < 0.1 and move_m < 0.01
 
 
+def test_a_rig_of_cameras_far_from_the_person_is_found() -> None:
+    """At 300 m the person is so small an angle that SQPnP, which adds the third and fourth camera, refuses it."""
+    middle_m, K = np.array([0, 0, 0.9]), np.array([[85e3, 0, 499.5], [0, 85e3, 499.5], [0, 0, 1]])
+    places_m = [(camera.name, middle_m + 85 * (camera.centre_m - middle_m)) for camera in ring(4)]
+    far = [dataclasses.replace(look_at(name, place_m, middle_m), K=K) for name, place_m in places_m]
+    found = first_poses([without_pose(camera) for camera in far], seen_by(far, 0.5))
+    turn_deg, move_m = worst_errors(found, far)
+    assert turn_deg < 0.1 and move_m < 0.01 * 300
+
+
 def test_a_camera_that_sees_the_person_for_a_moment_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
     """One of the three frames of the start is among the four that c3 shares with the others: 25 of the 50 keypoints
     that it takes."""
