@@ -294,7 +294,7 @@ def _write_cameras(
     areas: dict[str, Area] = {}
     for name, recording in footage.items():
         log.info("camera %s: %d frames from %s", name, len(frames), recording.path)
-        lens, area = _lens_as_recorded(lenses[name], recording, frames)
+        lens, area = lens_as_recorded(lenses[name], recording, frames)
         areas |= {name: area} if area else {}
         normalisers[name] = _write_pixels(layout, lens, recording, frames, settings, out)
     return normalisers, areas
@@ -366,7 +366,7 @@ def _mask_paths(
     return {frame: found[own] for frame, own in recorded.items()}
 
 
-def _lens_as_recorded(lens: Lens, footage: Footage | InStep, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
+def lens_as_recorded(lens: Lens, footage: Footage | InStep, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
     """Return the lens for the recorded size, and the area that the calibrated picture fills if black bars prove it.
 
     Without such a proof the lens is unchanged. Raises InputError if the sizes then differ too much.

@@ -11,7 +11,7 @@ from hnerf.calibration.clocks.keypoints import Track
 from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.capture.clocks import frame_times_s
 from hnerf.capture.footage import Video
-from hnerf.capture.ingest import DEFAULT_FPS, ingest, recognise
+from hnerf.capture.ingest import DEFAULT_FPS, ingest, lens_as_recorded, recognise
 from hnerf.capture.lens import Lens, undistort_keypoints
 from hnerf.capture.manifest import read_manifest
 from hnerf.capture.subject import subject_keypoints
@@ -29,7 +29,7 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
 
     Each camera is read separately, with its own frames and times. If the folder has a calibration, the cameras'
     geometry distinguishes offsets that would otherwise look alike. Raises InputError if the recordings do not determine
-    the clocks.
+    the clocks, or are not of the calibrated size.
     """
     names = cameras_without_calibration(folder)
     if not names:
@@ -38,9 +38,11 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
     lenses, tracks, sounds = _calibration(folder, names), dict[str, Track](), dict[str, np.ndarray]()
     for name in names:
         alone = Uncalibrated(folder, only=name)
+        footage = alone.footage(name)
+        if name in lenses:
+            lenses[name] = lens_as_recorded(lenses[name], footage, footage.frames)[0]
         with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
             tracks[name] = _track(alone, name, fps, lenses.get(name), Path(scratch))
-        footage = alone.footage(name)
         sound = read_sound(footage.path) if isinstance(footage, Video) else None
         if sound is not None:
             sounds[name] = sound

@@ -11,7 +11,8 @@ from PIL import Image
 
 from flows.cli import main
 from hnerf.calibration.bundle import align
-from hnerf.calibration.clocks.recording import _track
+from hnerf.calibration.clocks import recording
+from hnerf.calibration.clocks.recording import _track, synchronise_recording
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.clocks import read_clocks
 from hnerf.capture.formats.easymocap import EasyMocap, write_easymocap
@@ -24,6 +25,7 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from tests.calibration.clocks.test_clocks import filmed
 from tests.calibration.synthetic import detections, ring
+from tests.capture import recordings as rec
 
 FRAMES = 12
 
@@ -90,6 +92,32 @@ def test_the_command_synchronises_a_folder(tmp_path: Path, capsys: pytest.Captur
     assert read_clocks(folder)["c1"].offset_s == pytest.approx(0.5, abs=0.1 / 30)
     assert main(["synchronise", str(folder)]) == 2
     assert "remove it to synchronise again" in capsys.readouterr().err
+
+
+def test_recordings_of_another_size_than_the_calibration_are_not_synchronised(tmp_path: Path) -> None:
+    folder = rec.write_pose2sim(tmp_path / "film")
+    calibration = folder / "calibration" / "Calib.toml"
+    calibration.write_text(calibration.read_text().replace("[64.0, 48.0]", "[128.0, 96.0]"))
+    with pytest.raises(InputError, match=r"cam01\.mp4: is 64 x 48 px, but camera cam01 was calibrated at 128 x 96"):
+        synchronise_recording(folder)
+
+
+def test_cameras_recorded_in_black_bars_are_synchronised_with_the_lens_of_what_the_bars_enclose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """8 px of bars above and below a picture of 64 x 48 px, whose middle row is 23.5."""
+    folder = rec.write_pose2sim(tmp_path / "film")
+    for video in (folder / "videos").iterdir():
+        video.unlink()
+        barred = np.pad(np.full((48, 64, 3), 120, np.uint8), ((8, 8), (0, 0), (0, 0)))
+        (folder / "images" / video.stem).mkdir(parents=True)
+        for frame in range(10):
+            Image.fromarray(barred).save(folder / "images" / video.stem / f"{frame:06d}.png")
+    used: dict[str, Camera] = {}
+    monkeypatch.setattr(recording, "_track", lambda *_: None)
+    monkeypatch.setattr(recording, "estimate_clocks", lambda _, cameras, __: used.update(cameras))
+    synchronise_recording(folder)
+    assert [camera.K[1, 2] for camera in used.values()] == pytest.approx([31.5, 31.5], abs=0.1)
 
 
 def test_tracks_are_in_pixels_of_the_recorded_images(tmp_path: Path) -> None:
