@@ -35,7 +35,8 @@ log = logging.getLogger("hnerf.capture")
 class Board(BaseModel):
     """A flat board of squares: ChArUco, or a plain checkerboard without a marker dictionary.
 
-    `marker_share`: side of a marker relative to a square's; `inverted`: printed white on black.
+    `marker_share`: side of a marker relative to a square's; `inverted`: printed white on black;
+    `legacy_pattern`: ChArUco as OpenCV drew it before version 4.6, which differs if `rows` is even.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -46,6 +47,7 @@ class Board(BaseModel):
     dictionary: str | None = Field(default=None, pattern=r"^DICT_[A-Z0-9_]{1,32}$")
     marker_share: float = Field(default=0.75, ge=0.1, le=0.99)
     inverted: bool = False
+    legacy_pattern: bool = False
 
     @property
     def corners_m(self) -> np.ndarray:
@@ -66,6 +68,7 @@ class BoardDetector:
             dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
             size, marker_m = (board.columns, board.rows), board.marker_share * board.square_m
             squares = cv2.aruco.CharucoBoard(size, board.square_m, marker_m, dictionary)
+            squares.setLegacyPattern(board.legacy_pattern)
             self.charuco = cv2.aruco.CharucoDetector(squares, parameters)
 
     def corners_px(self, rgb: np.ndarray) -> np.ndarray:
@@ -258,6 +261,7 @@ def _from_caliscope(path: Path) -> dict[str, Any]:
             "dictionary": table["dictionary"],
             "marker_share": table["aruco_scale"],
             "inverted": table["inverted"],
+            "legacy_pattern": table.get("legacy_pattern", False),
         }
     except (KeyError, OverflowError, TypeError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"{path}: board: {error} is missing or not a number; write it again with Caliscope") from None

@@ -106,6 +106,23 @@ def test_charuco_corners_lie_between_pixels(inverted: bool) -> None:
     assert np.isnan(BoardDetector(board).corners_px(charuco_picture(not inverted))).all()
 
 
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_board_of_even_rows_is_found_in_the_pattern_that_caliscope_names(legacy: bool, tmp_path: Path) -> None:
+    """OpenCV before 4.6 began such boards with a white square."""
+    stated = CHARUCO.replace("rows = 5", "rows = 6").replace("inverted = true", "inverted = false")
+    (tmp_path / "charuco.toml").write_text(stated + "legacy_pattern = true\n" * legacy)
+    board = read_board(tmp_path)
+    assert board is not None
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    drawn = cv2.aruco.CharucoBoard((4, 6), 0.054, 0.0405, dictionary)
+    drawn.setLegacyPattern(legacy)
+    picture = drawn.generateImage((4 * SQUARE_PX, 6 * SQUARE_PX))
+    picture = cv2.copyMakeBorder(picture, 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=255)
+    found = BoardDetector(board).corners_px(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB))
+    expected = [[19.5 + 40 * x, 19.5 + 40 * y] for y in (1, 2, 3, 4, 5) for x in (1, 2, 3)]
+    assert np.abs(found - expected).max() < 0.25
+
+
 @pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
 def test_the_first_corner_of_a_checkerboard_is_the_same_at_any_rotation(quarter_turns: int) -> None:
     picture = checkerboard_picture(6, 5)
