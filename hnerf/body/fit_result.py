@@ -9,6 +9,8 @@ from torch import Tensor
 
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 
+POSED_AT_ONCE = 256  # frames; each takes a megabyte beside its vertices
+
 
 @dataclass(frozen=True)
 class BodyFit:
@@ -35,7 +37,8 @@ class BodyFit:
 
     def vertices_m(self) -> Tensor:
         """Return the posed vertices in the world, (n, V, 3)."""
-        return pose_vertices(self.rig, self.theta, self.root)
+        parts = zip(self.theta.split(POSED_AT_ONCE), self.root.split(POSED_AT_ONCE), strict=True)
+        return torch.cat([pose_vertices(self.rig, theta, root) for theta, root in parts])
 
     def save(self, folder: Path) -> None:
         """Write `body.npz` (its keys: docs/design.md) and `rig.npz`."""
