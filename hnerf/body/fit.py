@@ -72,9 +72,9 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         model, given = body_model(settings), capture.given_poses()
         given_pose = initial_pose_from_given(given, model, capture.frames) if given else None
         observations = (
-            observe(capture)
-            if capture.has_keypoints or given_pose is None
-            else observations_of_pose(given_pose, capture)
+            observations_of_pose(given_pose, given.known, capture)
+            if given and given_pose and not capture.has_keypoints
+            else observe(capture)
         )
         smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * ACCELERATION_SCALE)
         up, single = "xyz".index(capture.up), len(observations.cameras) == 1

@@ -68,10 +68,14 @@ def given_poses_note(model: BodyModel, capture: Capture) -> str:
     return how if capture.has_keypoints else f"{how}, and in place of keypoints, which are missing"
 
 
-def observations_of_pose(pose: Pose, capture: Capture) -> Observations:
-    """Return the pose's own keypoints as the training cameras would see them."""
+def observations_of_pose(pose: Pose, known: np.ndarray, capture: Capture) -> Observations:
+    """Return the pose's own keypoints as the training cameras would see them in the frames whose pose is `known`, (n,)
+    bool; the others show nothing."""
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
     points_m = pose.rig.keypoint_weights @ pose_vertices(pose.rig, pose.theta, pose.root)  # (n, 25, 3)
     pixels = torch.stack([project(camera, points_m)[0] for camera in cameras])
     ahead = torch.stack([torch.from_numpy(camera.project(points_m.numpy())[1]) > NEAR_M for camera in cameras])
-    return Observations(cameras, pixels, CONFIDENCE * ahead.double(), points_m)
+    given = torch.from_numpy(known)[:, None]
+    return Observations(
+        cameras, pixels, CONFIDENCE * (ahead & given).double(), torch.where(given[..., None], points_m, torch.nan)
+    )

@@ -65,6 +65,19 @@ def test_frames_without_a_given_pose_take_that_of_the_nearest_frame(model_file: 
     assert not torch.equal(pose.theta[0], pose.theta[2])
 
 
+def test_a_frame_without_a_given_pose_is_no_evidence_for_that_of_another(model_file: Path, tmp_path: Path) -> None:
+    """The person moves by 2 cm a frame. In the middle frame only the motion, which the fit trusts little here, tells
+    where."""
+    given = parameters()
+    given.theta[1], given.root[1] = np.nan, np.nan
+    given.root[2, 0, 3] += 0.04
+    capture, _ = recorded(model_file, tmp_path, given)
+    fit, report = fit_body(capture, None, FitSettings(body_model=model_file, acceleration_mps2=100.0))
+    first, middle, last = joints_m(fit)[:, 0, 0].tolist()
+    assert last - first == pytest.approx(0.04, abs=0.002) and middle - first == pytest.approx(0.02, abs=0.002)
+    assert report["keypoint_residual_px"][1] is None
+
+
 def test_outlines_correct_given_poses_without_keypoints(model_file: Path, tmp_path: Path) -> None:
     """The given poses are 3 cm off, with arms 0.15 rad too high."""
     wrong = parameters()
