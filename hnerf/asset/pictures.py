@@ -8,7 +8,7 @@ from hnerf.asset.splat_rendering import render_splats
 from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.staging import StagedAvatar
-from hnerf.evaluation.pictures import Shot, normals_at, portrait_camera, shoot, studio_light, supersampled
+from hnerf.evaluation.pictures import SUPERSAMPLING, Shot, normals_at, portrait_camera, shoot, studio_light
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.rays import RayHits
@@ -67,7 +67,7 @@ def splats_on_black(
     """Render splats on a mesh with vertices points_m (V, 3), as in `looks_on_black`."""
     middles_m, _, quaternions = splats.on(points_m)
     exposed = np.minimum(splats.colours * np.array(gain), 1)
-    fine = render_splats(middles_m, quaternions, splats.scales_m, OPACITY, exposed, supersampled(camera))
+    fine = render_splats(middles_m, quaternions, splats.scales_m, OPACITY, exposed, camera.scaled(SUPERSAMPLING))
     averaged = cv2.resize(255 * fine, size_px, interpolation=cv2.INTER_AREA)
     return averaged.round().astype(np.uint8)
 

@@ -124,7 +124,7 @@ class Shot:
 
 def shoot(surface: Surface, camera: Camera) -> Shot:
     """Cast the rays of a camera's supersampled image."""
-    fine = supersampled(camera)
+    fine = camera.scaled(SUPERSAMPLING)
     return Shot(surface.mesh, camera, fine, cast_pixels(surface, fine))
 
 
@@ -185,11 +185,6 @@ def _headlight(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarr
     """Return the brightness (H, W) under a light at the camera."""
     facing = -(normals_at(mesh, hits) @ camera.R.T)[:, 2]
     return (0.35 + 0.65 * facing.clip(0, 1)).reshape(camera.height_px, camera.width_px)
-
-
-def supersampled(camera: Camera) -> Camera:
-    """Return the camera with SUPERSAMPLING times the pixels along each side."""
-    return camera.scaled(SUPERSAMPLING)
 
 
 def _outline(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
