@@ -2,6 +2,7 @@
 against the masked photograph."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,19 +56,20 @@ def compare_with_field(
     tested = [view for view in all_views(capture, NOVEL_VIEW) if capture.has_given_mask(view.camera, view.frame)]
     trained = [view for view in all_views(capture, TRAINING_VIEW) if (view.camera, view.frame) in masks]
 
-    def compare(chosen: list[View]) -> list[Compared]:
+    def compare(chosen: list[View], read_mask: Callable[[str, int], np.ndarray | None]) -> list[Compared]:
         surfaces = _skinned_surfaces(staged, [view.frame for view in chosen])
 
         def compare_view(view: View) -> Compared | None:
-            mask = _mask(capture, masks, view)
-            if not mask.any():
+            mask = read_mask(view.camera, view.frame)
+            if mask is None or not mask.any():
                 return None
             return _compared(capture, view, mask, avatar, staged, surfaces[view.frame], splats)
 
         compared = side_by_side(compare_view, chosen, avatar.body.theta.device)
         return [one for one in tracked(compared, "asset against field", len(chosen)) if one]
 
-    return (tested and compare(sample_views(tested, IMAGES))) or compare(sample_views(trained, IMAGES))
+    found = tested and compare(sample_views(tested, IMAGES), capture.given_mask)
+    return found or compare(sample_views(trained, IMAGES), masks.get)
 
 
 def comparison_figures(compared: list[Compared]) -> dict[str, Any]:
@@ -119,16 +121,6 @@ def require_close(name: str, topology: str, figures: dict[str, Any], allow_poor:
             f"{found}; at most {POOR_DB:.0f} dB are allowed. Try another asset.topology or a larger asset.texture_px, "
             "or take it as it is: asset.allow_poor=true (`hnerf export --allow-poor`)"
         )
-
-
-def _mask(capture: Capture, masks: Masks, view: View) -> np.ndarray:
-    """Return a view's mask (H, W) bool: the segmentation's for training cameras, the recording's own for test
-    cameras."""
-    if view.split != NOVEL_VIEW:
-        return masks.get(view.camera, view.frame)
-    given = capture.given_mask(view.camera, view.frame)
-    assert given is not None  # views without a mask were left out
-    return given
 
 
 def _skinned_surfaces(staged: StagedAvatar, frames: list[int]) -> dict[int, Surface]:
