@@ -118,7 +118,7 @@ class Problem:
     def image_term(self, x: Tensor) -> DataTerm:
         """Return the data term of reprojected keypoints, with pixel residuals converted to metres."""
         return reprojection_term(
-            self.observations.views, self.scale_m, x, self.priors.keypoint_m, self.priors.keypoint_outlier_m
+            self.observations, self.scale_m, x, self.priors.keypoint_m, self.priors.keypoint_outlier_m
         )
 
     def apply_step(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:

@@ -11,26 +11,17 @@ from hnerf.body.reprojection import Views
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import ranked_people
 from hnerf.capture.timing import median_step
-from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
 
 MAX_GAP = 2  # median steps between neighbours in one run: where frames are unevenly spaced, or one is missing
 
 
 @dataclass(frozen=True)
-class Observations:
+class Observations(Views):
     """Observed keypoints: pixels (C, n, 25, 2) and confidence (C, n, 25) of the training cameras, float64; space_m (n,
     25, 3), triangulated, NaN where fewer than two cameras agree."""
 
-    cameras: tuple[Camera, ...]
-    pixels: Tensor
-    confidence: Tensor
     space_m: Tensor
-
-    @property
-    def views(self) -> Views:
-        """Return the keypoints as the cameras see them."""
-        return Views(self.cameras, self.pixels, self.confidence)
 
     def keypoints(self, camera: int) -> np.ndarray:
         """Return what one camera sees, (n, 25, 3): x_px, y_px, confidence."""
