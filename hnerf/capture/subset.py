@@ -51,7 +51,6 @@ def subset(
     if not kept.train_cameras or not kept.train_frames:
         raise InputError(f"{capture.name}: no training camera or frame would be left; keep one of each")
     write_arrays(capture, kept)
-    copy_files(capture.root, out, {Path(BOARDS_FILE).stem})
     for name in kept.cameras:
         copy_pixels(capture, kept, name)
     kept.save()
@@ -79,8 +78,8 @@ def write_arrays(
     change: PointChange = lambda _, points: points,
     shown: Mapping[str, tuple[int, ...]] | None = None,
 ) -> None:
-    """Write keypoints, hands, landmarks and given poses of the kept frames and cameras. `change(camera, points)` is
-    applied to all image points (frames, ..., 3). shown: as in `copy_pixels`, by camera."""
+    """Write keypoints, hands, landmarks and given poses of the kept frames and cameras, and copy the board footage.
+    `change(camera, points)` is applied to all image points (frames, ..., 3). shown: as in `copy_pixels`, by camera."""
     frames = dict.fromkeys(kept.cameras, kept.frames) | dict(shown or {})
     rows = {name: np.searchsorted(capture.frames, frames[name]) for name in kept.cameras}
     for file, read in ((KEYPOINTS, capture.keypoints), (HANDS, capture.hands)):
@@ -97,6 +96,7 @@ def write_arrays(
     if poses:
         own = np.searchsorted(capture.frames, kept.frames)
         dataclasses.replace(poses, theta=poses.theta[own], root=poses.root[own]).save(kept.root / "poses.npz")
+    copy_files(capture.root, kept.root, {Path(BOARDS_FILE).stem})
 
 
 def read_keypoints(capture: Capture) -> dict[str, np.ndarray]:

@@ -7,9 +7,8 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from hnerf.capture.board_footage import BOARDS_FILE
 from hnerf.capture.capture import Capture
-from hnerf.capture.subset import copy_files, copy_pixels, require_several_cameras, subject_point, subset, write_arrays
+from hnerf.capture.subset import copy_pixels, require_several_cameras, subject_point, subset, write_arrays
 from hnerf.errors import NotApplicableError
 
 T = TypeVar("T")
@@ -49,7 +48,6 @@ def delay_camera(capture: Capture, frames: float, rng: np.random.Generator, out:
     write_arrays(capture, kept, shown=shown)
     for name in capture.cameras:
         copy_pixels(capture, kept, name, shown.get(name))
-    copy_files(capture.root, out, {Path(BOARDS_FILE).stem})
     kept.save()
 
 

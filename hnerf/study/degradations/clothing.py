@@ -14,6 +14,7 @@ import numpy as np
 
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
+from hnerf.capture.board_footage import BOARDS_FILE
 from hnerf.capture.capture import PERSON, Capture, write_image
 from hnerf.capture.subset import copy_files, write_arrays
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
@@ -151,6 +152,7 @@ def add_clothing(
     garment = sewn(keypoints_m, np.eye(3)["xyz".index(capture.up)], strength, rng)
     kept = dataclasses.replace(capture, root=out, frame_offsets={}, stored_frames=(), recorded_lenses={})
     write_arrays(capture, kept)
+    (out / BOARDS_FILE).unlink(missing_ok=True)
     for row, frame in enumerate(capture.frames):
         lit_garment = LitGarment.over_body(garment, row, bodies_m[rows[row]], faces, capture.up)
         for name in capture.cameras:

@@ -13,14 +13,7 @@ import numpy as np
 
 from hnerf.capture.board_footage import BOARDS_FILE
 from hnerf.capture.capture import PERSON, Capture, write_image
-from hnerf.capture.subset import (
-    PointChange,
-    copy_files,
-    copy_pixels,
-    require_several_cameras,
-    subject_point,
-    write_arrays,
-)
+from hnerf.capture.subset import PointChange, copy_pixels, require_several_cameras, subject_point, write_arrays
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
@@ -92,7 +85,6 @@ def rewrite_images(
         plate = capture.background(name)
         if plate is not None:
             write_image(out / "background" / f"{name}.jpg", change(name, plate))
-    copy_files(capture.root, out, {Path(BOARDS_FILE).stem})
     kept.save()
 
 
