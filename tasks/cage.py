@@ -69,7 +69,8 @@ def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> 
             reader.kill()
             raise
     if error:
-        raise _exception(**error)
+        kinds: dict[str, type[Exception]] = {"InputError": InputError, "OSError": OSError}
+        raise kinds.get(error["error"], RuntimeError)(*error["arguments"])
     if reader.returncode > 0:
         raise RuntimeError(f"{opened}: its reader ended with exit code {reader.returncode}")
     if reader.returncode < 0:
@@ -84,11 +85,6 @@ def _pass_on(message: dict[str, Any]) -> None:
     if "log" in message:
         name, level, text = message["log"]
         logging.getLogger(name).log(level, "%s", text)
-
-
-def _exception(error: str, arguments: list[Any]) -> Exception:
-    kinds: dict[str, type[Exception]] = {"InputError": InputError, "OSError": OSError}
-    return kinds.get(error, RuntimeError)(*arguments)
 
 
 def _killed(opened: Path, by: signal.Signals) -> Exception:
