@@ -99,12 +99,6 @@ def write_arrays(
     copy_files(capture.root, kept.root, {Path(BOARDS_FILE).stem})
 
 
-def read_keypoints(capture: Capture) -> dict[str, np.ndarray]:
-    """Return keypoints (frames, people, 25, 3), px and score, of every camera in which anyone was detected."""
-    found = {name: capture.keypoints(name) for name in capture.cameras}
-    return {name: people for name, people in found.items() if people is not None}
-
-
 def write_points(path: Path, points: dict[str, np.ndarray]) -> None:
     """Write arrays of points by name; no file if there are none."""
     path.parent.mkdir(parents=True, exist_ok=True)

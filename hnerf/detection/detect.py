@@ -19,7 +19,7 @@ import numpy as np
 from hnerf.capture.capture import KEYPOINTS, LANDMARKS, PERSON, Capture, write_image
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.subject import ranked_people
-from hnerf.capture.subset import read_keypoints, write_points
+from hnerf.capture.subset import write_points
 from hnerf.config import DetectionSettings
 from hnerf.detection.landmarks import POINTS, SIZE, LandmarkNetwork, Person
 from hnerf.detection.merge import fill_missing, pad_people
@@ -83,7 +83,7 @@ def with_keypoints(capture: Capture, out: Path) -> Capture:
 
 def _with_own(capture: Capture, people: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the recording's own keypoints of people, completed by the network's."""
-    own = read_keypoints(capture)
+    own = {name: points for name in capture.cameras if (points := capture.keypoints(name)) is not None}
     filled = {
         name: pad_people([fill_missing(*pair) for pair in zip(own[name], points, strict=True)])
         for name, points in people.items()
