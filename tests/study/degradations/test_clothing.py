@@ -86,6 +86,7 @@ def dressed(tmp_path: Path) -> tuple[Capture, GroundTruth]:
     a triangle."""
     good = write_recording(tmp_path / "good")
     write_detected(good)
+    (good.root / "boards.npz").write_bytes(b"corners")
     folder = good.root / "ground_truth"
     mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     mask[7:9, 7:9] = 255
@@ -115,6 +116,7 @@ def test_a_garment_is_drawn_where_the_body_does_not_hide_it(tmp_path: Path) -> N
     assert (255 * likely).round().sum() == 8 * 255 + 56 * 200 + 192 * 2
     assert bad.keypoints("02")[0, 0, 1].tolist() == [2, 5, 1]  # type: ignore[index]
     assert bad.background("02").mean() == pytest.approx(50, abs=1)  # type: ignore[union-attr]
+    assert not (bad.root / "boards.npz").exists()
 
 
 def test_a_garment_is_added_to_the_ground_truth_too(tmp_path: Path) -> None:
