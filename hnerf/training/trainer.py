@@ -74,7 +74,9 @@ class Trainer:
         bodies = PosedBodies(self.body.rig, self.body.theta, self.body.root, self.field.canonical_m)
         ground_axis = "xyz".index(capture.up) if settings.ground else None
         self.objective = Objective(self.field, bodies.correction(), settings, ground_axis)
-        self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
+        poses = {"params": list(self.objective.correction.parameters()), "lr": settings.pose_learning_rate}
+        groups = [*self.field.parameter_groups(), poses]
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
         logger.info("gathering pixels")
@@ -107,10 +109,6 @@ class Trainer:
     def _novel_frames_learn(self) -> bool:
         learns = self.settings.pose_learning_rate > 0 or len(self.field.frame_parameters()) > 0
         return learns and len(self.novel_rows) > 0
-
-    def _parameter_groups(self) -> list[dict[str, Any]]:
-        rate = self.settings.pose_learning_rate
-        return [*self.field.parameter_groups(), {"params": list(self.objective.correction.parameters()), "lr": rate}]
 
     def _set_poses(self, bodies: PosedBodies) -> None:
         """Use the bodies' current poses for the coming steps."""
