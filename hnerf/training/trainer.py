@@ -168,16 +168,12 @@ class Trainer:
         if self.step <= self.field_steps:
             if self.only_centre_m is not None:
                 keep_distance(self.scene.bodies, self.body, self.train_rows, self.only_centre_m)
-            self._average_over_frames()
+            # What the training frames have in common applies to all poses; with one posture it is the posture itself.
+            self.field.average_over_frames(self.train_rows)
+            if self.field.common_rest and not self.settings.one_posture and len(self.train_rows) > 1:
+                share_rest(self.scene.bodies, self.body, self.train_rows)
             self.field.tighten(self.scene.bodies.rig, self.scene.conditions.pose[self.train_rows[::POSE_STRIDE]])
         self._set_poses(self.scene.bodies)
-
-    def _average_over_frames(self) -> None:
-        """Apply what the training frames have in common to all poses. What changes in the pose of a single frame, or in
-        a posture that all of them share, stays there."""
-        self.field.average_over_frames(self.train_rows)
-        if self.field.common_rest and not self.settings.one_posture and len(self.train_rows) > 1:
-            share_rest(self.scene.bodies, self.body, self.train_rows)
 
     def _freeze_field(self) -> None:
         """Freeze the field; the parameters of novel frames are fitted to it, so that it never learns from their
