@@ -43,11 +43,6 @@ class _Candidate:
     changes: dict[str, str]
     cost_px: float
 
-    def also(self, change: str) -> "_Candidate":
-        """Return the candidate with one more change of every changed camera."""
-        changes = {name: f"{before}; then {change}" for name, before in self.changes.items()}
-        return dataclasses.replace(self, changes=changes)
-
 
 def refine(
     capture: Capture,
@@ -85,7 +80,8 @@ def refine(
     more = Outlines.of(capture, FRAMES) if outlines else None
     followed, gain = follow_outlines(more, refined, free, points_m, settings.min_improvement)
     if gain and not _contradiction(matches, cameras, followed):
-        refined, chosen = followed, chosen.also(gain)
+        changes = {name: f"{before}; then {gain}" for name, before in chosen.changes.items()}
+        refined, chosen = followed, dataclasses.replace(chosen, changes=changes)
     gained = 1 - chosen.cost_px / held_out_px["as given"]
     outlines_px, refusal = judge_by_outlines(outlines, cameras, refined, gained)
     if refusal:
