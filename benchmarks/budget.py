@@ -17,8 +17,9 @@ import numpy as np
 from provenance import RESULTS, SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
 from flows.preparation import prepare_training
-from hnerf.config import Settings, TrainingSettings, load_settings
+from hnerf.config import Settings, TrainingSettings, load_settings, overridden
 from hnerf.study.benchmark.plan import ScoringSettings
+from hnerf.tables import pick
 from tasks.benchmark import score_training
 from tasks.capture import ingest
 from tasks.source import read_capture
@@ -91,16 +92,14 @@ def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[Tra
 
 def scaled(training: TrainingSettings, keys: tuple[str, ...], factor: float) -> TrainingSettings:
     """Return the settings with these values times `factor`; of grids, their numbers of cells in the volume."""
-    values = training.model_dump()
+    decided, side, changes = training.model_dump(), float(np.cbrt(factor)), []
     for key in keys:
-        *section, name = key.split(".")
-        place = values[section[0]] if section else values
-        value = place[name]
-        if isinstance(value, tuple):
-            place[name] = tuple(round(float(np.cbrt(factor)) * n) for n in value)
-        else:
-            place[name] = max(round(factor * value), min(value, 1))  # 0 would be chosen from the scene
-    return TrainingSettings.model_validate(values)
+        value = pick(decided, key)
+        cells = isinstance(value, tuple)
+        # Settings that are 0 would be chosen from the scene.
+        changed = [round(side * n) for n in value] if cells else max(round(factor * value), min(value, 1))
+        changes.append(f"{key}={changed}")
+    return overridden(training, changes)
 
 
 def figures(found: dict[str, Any]) -> dict[str, Any]:

@@ -55,21 +55,22 @@ def compare_with_field(
     show the person, else from training cameras. The list is empty if no chosen view has a mask of the person."""
     tested = [view for view in all_views(capture, NOVEL_VIEW) if capture.has_given_mask(view.camera, view.frame)]
     trained = [view for view in all_views(capture, TRAINING_VIEW) if (view.camera, view.frame) in masks]
+    seen = _showing_the_person(tested, capture.given_mask) or _showing_the_person(trained, masks.get)
+    surfaces = _skinned_surfaces(staged, [view.frame for view in seen])
 
-    def compare(chosen: list[View], read_mask: Callable[[str, int], np.ndarray | None]) -> list[Compared]:
-        surfaces = _skinned_surfaces(staged, [view.frame for view in chosen])
+    def compare(view: View) -> Compared:
+        return _compared(capture, view, seen[view], avatar, staged, surfaces[view.frame], splats)
 
-        def compare_view(view: View) -> Compared | None:
-            mask = read_mask(view.camera, view.frame)
-            if mask is None or not mask.any():
-                return None
-            return _compared(capture, view, mask, avatar, staged, surfaces[view.frame], splats)
+    compared = side_by_side(compare, list(seen), avatar.body.theta.device)
+    return list(tracked(compared, "asset against field", len(seen)))
 
-        compared = side_by_side(compare_view, chosen, avatar.body.theta.device)
-        return [one for one in tracked(compared, "asset against field", len(chosen)) if one]
 
-    found = tested and compare(sample_views(tested, IMAGES), capture.given_mask)
-    return found or compare(sample_views(trained, IMAGES), masks.get)
+def _showing_the_person(
+    views: list[View], read_mask: Callable[[str, int], np.ndarray | None]
+) -> dict[View, np.ndarray]:
+    """Return at most IMAGES views with their masks (H, W) bool, without those whose mask is empty."""
+    found = {view: read_mask(view.camera, view.frame) for view in sample_views(views, IMAGES)}
+    return {view: mask for view, mask in found.items() if mask is not None and mask.any()}
 
 
 def comparison_figures(compared: list[Compared]) -> dict[str, Any]:

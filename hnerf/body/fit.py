@@ -34,7 +34,7 @@ from hnerf.body.posture_prior import PosturePrior
 from hnerf.body.reprojection import project
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
-from hnerf.capture.timing import median_step
+from hnerf.capture.timing import median_step, nearest_rows
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from hnerf.geometry.silhouette import silhouette
@@ -152,14 +152,14 @@ def initial_pose(capture: Capture, observations: Observations, model: BodyModel)
         roots = [root_from_space(rest_m, points_m) for points_m in observations.space_m.numpy()]
     else:
         roots = [root_from_image(observations.cameras[0], rest_m, seen) for seen in observations.keypoints(0)]
-    placed = {frame: root for frame, root in zip(capture.frames, roots, strict=True) if root is not None}
+    placed = {row: root for row, root in enumerate(roots) if root is not None}
     shown = int((observations.confidence > 0).any(-1).any(0).sum())  # the person may enter late
     if not placed or len(placed) < shown / 2:
         raise InputError(
             f"{capture.root / 'keypoints.npz'}: head and trunk are found by enough cameras in only {len(placed)} of "
             f"{shown} frames with a person; check the keypoint files and the calibration, or leave those frames out"
         )
-    nearest = [placed[min(placed, key=lambda known: abs(known - frame))] for frame in capture.frames]
+    nearest = [placed[row] for row in nearest_rows(list(placed), capture.frames)]
     theta = torch.zeros(len(roots), len(rig.joints_m), 3, dtype=torch.float64)
     theta[:, articulation.joints[1:]] = PosePrior(articulation).mean_pose()
     return Pose(rig, theta, torch.from_numpy(np.stack(nearest)), torch.zeros(25, 3, dtype=torch.float64))

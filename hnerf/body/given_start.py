@@ -15,6 +15,7 @@ from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
 from hnerf.body.smpl import BODY_FROM_SMPL, JOINTS, LOCKED
 from hnerf.capture.capture import Capture
 from hnerf.capture.given_poses import GivenPoses
+from hnerf.capture.timing import nearest_rows
 
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)  # of JOINTS
 # Of the mean SMPL body, rounded; anny has no joint at the pelvis.
@@ -29,9 +30,7 @@ def initial_pose_from_given(given: GivenPoses, model: BodyModel, frames: Sequenc
 
     frames (n,): numbers of the given rows. Frames without a pose take the pose of the nearest frame that has one.
     """
-    known = given.known.nonzero()[0]
-    numbers = np.asarray(frames)[known]
-    nearest = torch.from_numpy(known[[np.abs(numbers - frame).argmin() for frame in frames]])
+    nearest = nearest_rows(given.known.nonzero()[0].tolist(), frames)
     rig = model.rig(torch.from_numpy(given.betas) if model.is_smpl else None)
     turns = rotation_from_axis_angle(torch.from_numpy(given.theta))[nearest]
     placed = torch.from_numpy(given.root)[nearest]

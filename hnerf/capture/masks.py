@@ -55,12 +55,12 @@ def encode(mask: np.ndarray) -> bytes:
 def movement_px(before: Masks, after: Masks) -> float:
     """Return the mean, over the views in which both have an edge, of the mean distance from the edges after to the
     edges before; infinity without such a view. A mask that fills the image has no edge."""
-    pairs = ((_edge(before.get(*view)), _edge(after.get(*view))) for view in after.encoded if view in before)
+    pairs = ((outline(before.get(*view)), outline(after.get(*view))) for view in after.encoded if view in before)
     moved = [_edge_distance_px(*pair) for pair in pairs if pair[0].any() and pair[1].any()]
     return float(np.mean(moved)) if moved else float("inf")
 
 
-def _edge(mask: np.ndarray) -> np.ndarray:
+def outline(mask: np.ndarray) -> np.ndarray:
     """Return the outermost pixels of a mask (H, W) bool, without those that only the image's border cuts off."""
     return mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 

@@ -16,6 +16,12 @@ def nearest_frame(frame: int, offset_frames: float, step: int = 1) -> int:
     return frame + step * int(np.floor(offset_frames / step + 0.5))
 
 
+def nearest_rows(known: Sequence[int], frames: Sequence[int]) -> list[int]:
+    """Return for each frame the known row whose frame is nearest in time, the earlier one of two."""
+    numbers, rows = np.asarray(frames), np.asarray(known)
+    return rows[[np.abs(numbers[rows] - frame).argmin() for frame in frames]].tolist()
+
+
 def median_step(frames: Sequence[int]) -> int:
     """Return the median difference between neighbouring frame numbers (at least one, in order)."""
     return int(np.median(np.diff(frames))) if len(frames) > 1 else 1

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hnerf.avatar.avatar import Avatar, Rendering
 from hnerf.avatar.surface import normals_and_distances, posed_surface
+from hnerf.body.observations import MAX_GAP
 from hnerf.capture.capture import read_rgb, write_image
 from hnerf.capture.footage import MIN_FPS, Video
 from hnerf.geometry.camera import Camera
@@ -23,7 +24,6 @@ from hnerf.progress import tracked
 COVERED = 0.5  # alpha from which a pixel has a depth and a normal
 NEAR_GREY, FAR_GREY = 255, 64  # grey levels at the ends of a depth video's range
 NORMAL_STEP_M = 0.005  # of differences of the signed distance
-MAX_GAP = 2  # median steps between frame numbers; beyond it is another recording, as for the fit
 Shot = tuple[Camera, int]  # a camera, and the frame of avatar.body whose pose is shown
 
 

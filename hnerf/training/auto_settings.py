@@ -11,7 +11,7 @@ import numpy as np
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
-from hnerf.capture.masks import Masks
+from hnerf.capture.masks import Masks, outline
 from hnerf.config import FastFieldSettings, TrainingSettings
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
@@ -187,10 +187,9 @@ def _outline_distance_px(mask: np.ndarray, covered: np.ndarray) -> np.ndarray:
     fills the image or is not in it."""
     if covered.all() or not covered.any():
         return np.zeros(0)
-    outline = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     outwards = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     inwards = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return (outwards - inwards)[outline]
+    return (outwards - inwards)[outline(mask)]
 
 
 def _thickness_m(reach_m: float) -> float:

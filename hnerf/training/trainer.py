@@ -168,7 +168,8 @@ class Trainer:
         if self.step <= self.field_steps:
             if self.only_centre_m is not None:
                 keep_distance(self.scene.bodies, self.body, self.train_rows, self.only_centre_m)
-            # What the training frames have in common applies to all poses; with one posture it is the posture itself.
+            # What the training frames have in common applies to all poses; changes in the pose of a single frame, or in
+            # a posture that all of them share, stay there.
             self.field.average_over_frames(self.train_rows)
             if self.field.common_rest and not self.settings.one_posture and len(self.train_rows) > 1:
                 share_rest(self.scene.bodies, self.body, self.train_rows)

@@ -57,12 +57,14 @@ def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture
 
 
 def test_frames_without_a_given_pose_take_that_of_the_nearest_frame(model_file: Path) -> None:
-    """The unknown frame in the middle is one row away from both others, but nearer in time to the last one."""
-    given = parameters()
-    given.theta[1], given.root[1] = np.nan, np.nan
-    pose = initial_pose_from_given(given, body_model(FitSettings(body_model=model_file)), (0, 8, 9))
-    assert torch.equal(pose.theta[1], pose.theta[2]) and torch.equal(pose.root[1], pose.root[2])
-    assert not torch.equal(pose.theta[0], pose.theta[2])
+    """The first frame is unknown; then the middle one, one row away from both others but nearer in time to the last."""
+    model = body_model(FitSettings(body_model=model_file))
+    for unknown, frames, taken, other in ((0, (0, 1, 2), 1, 2), (1, (0, 8, 9), 2, 0)):
+        given = parameters()
+        given.theta[unknown], given.root[unknown] = np.nan, np.nan
+        pose = initial_pose_from_given(given, model, frames)
+        assert torch.equal(pose.theta[unknown], pose.theta[taken]) and torch.equal(pose.root[unknown], pose.root[taken])
+        assert not torch.equal(pose.theta[taken], pose.theta[other])
 
 
 def test_a_frame_without_a_given_pose_is_no_evidence_for_that_of_another(model_file: Path, tmp_path: Path) -> None:

@@ -177,14 +177,7 @@ def test_mattes_are_thresholded_in_the_middle_but_labels_at_zero(folder: Path, t
     matte[3:13, 19:22] = np.array([190, 120, 60])[:, None]
     many = matte.copy()
     many[13:] = np.linspace(0, 100, many[13:, :, 0].size).reshape(many.shape[0] - 13, -1)[..., None]
-    for frame in rec.FRAMES:
-        write_image(folder / "masks" / "01" / f"{frame:06d}.png", many if frame == 2 else matte)
-        write_image(folder / "masks" / "02" / f"{frame:06d}.png", labels)
-    capture = ingest(folder, SETTINGS, tmp_path / "out")
-    for frame in rec.FRAMES:
-        soft, hard = (capture.given_mask(camera, frame) for camera in rec.CAMERAS)
-        assert soft is not None and np.array_equal(soft, matte[..., 0] > 127)
-        assert hard is not None and np.array_equal(hard, labels[..., 0] > 0)
+    check_given_masks(folder, tmp_path, [many if frame == 2 else matte for frame in rec.FRAMES], labels)
 
 
 def test_antialiased_masks_do_not_grow(folder: Path, tmp_path: Path) -> None:
@@ -195,14 +188,20 @@ def test_antialiased_masks_do_not_grow(folder: Path, tmp_path: Path) -> None:
     covered[3:13, 5:19], parts[3:13, 5:19] = 255, 255
     covered[3:13, 4], covered[3:13, 19] = 64, 191
     parts[9:13, 5:19] = 100
-    for frame in rec.FRAMES:
-        write_image(folder / "masks" / "01" / f"{frame:06d}.png", covered)
-        write_image(folder / "masks" / "02" / f"{frame:06d}.png", parts)
+    check_given_masks(folder, tmp_path, [covered] * len(rec.FRAMES), parts)
+
+
+def check_given_masks(folder: Path, tmp_path: Path, mattes: list[np.ndarray], labels: np.ndarray) -> None:
+    """Check that camera 01's masks (H, W, 3), one a frame, are thresholded in the middle, and 02's, the same in all
+    frames, at zero."""
+    for frame, matte in zip(rec.FRAMES, mattes, strict=True):
+        write_image(folder / "masks" / "01" / f"{frame:06d}.png", matte)
+        write_image(folder / "masks" / "02" / f"{frame:06d}.png", labels)
     capture = ingest(folder, SETTINGS, tmp_path / "out")
-    for frame in rec.FRAMES:
+    for frame, matte in zip(rec.FRAMES, mattes, strict=True):
         soft, hard = (capture.given_mask(camera, frame) for camera in rec.CAMERAS)
-        assert soft is not None and np.array_equal(soft, covered[..., 0] > 127)
-        assert hard is not None and np.array_equal(hard, parts[..., 0] > 0)
+        assert soft is not None and np.array_equal(soft, matte[..., 0] > 127)
+        assert hard is not None and np.array_equal(hard, labels[..., 0] > 0)
 
 
 def test_a_distorted_recording_is_undistorted(folder: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture, write_image
-from hnerf.capture.timing import nearest_frame, resample
+from hnerf.capture.timing import nearest_frame, nearest_rows, resample
 from hnerf.geometry.camera import Camera
 
 
@@ -47,6 +47,11 @@ def test_a_keypoint_seen_in_one_frame_only_is_taken_from_it() -> None:
 def test_people_are_matched_between_frames_in_any_order() -> None:
     swapped = np.stack([people_at(0, 500), people_at(510, 10)])
     assert resample(swapped, (0, 1), np.array([0.4]))[0, :, 0, 0].tolist() == [4, 504]
+
+
+def test_the_known_row_nearest_in_time_is_found_and_the_earlier_one_of_two() -> None:
+    assert nearest_rows([0, 3], [0, 8, 9, 10]) == [0, 3, 3, 3]  # row 1 is nearer to row 0, but not in time
+    assert nearest_rows([0, 2], [0, 1, 2]) == [0, 0, 2]
 
 
 def test_hands_keep_their_order_however_far_they_move() -> None:
