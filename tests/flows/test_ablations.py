@@ -29,8 +29,8 @@ SPLIT = {
 @pytest.fixture
 def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSettings]:
     """Replace every stage by a fake; return the list that collects the training settings of each row. Training fails
-    without noise, and loses its worker without the eikonal loss. The PSNR in dB equals the weight of the segmentation
-    loss; without the residual loss, evaluation finds no surface."""
+    without noise, and loses its worker without the eikonal loss. The PSNR in dB equals the weight of the
+    reconstruction loss; with poses as fitted, evaluation finds no surface."""
     trained: list[TrainingSettings] = []
 
     def train(*inputs: Any) -> Any:
@@ -46,9 +46,9 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
         return SimpleNamespace(root=tmp_path)
 
     def evaluate(*inputs: Any) -> Any:
-        if trained[-1].losses.residual == 0:
+        if trained[-1].pose_learning_rate == 0:
             raise InputError("signed distance field: no surface in its box")
-        split = SPLIT | {"psnr": trained[-1].losses.segmentation}
+        split = SPLIT | {"psnr": trained[-1].losses.reconstruction}
         reason = "H-NeRF's static network models one moment"
         poses = split if trained[-1].field.kind == "fast" else unscored(reason) | {"geometry": None}
         metrics = {"protocol": "By eye.", "novel_view": split, "seconds": 5.0, "holdout": None}
@@ -100,21 +100,9 @@ def _leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def test_ablations_of_unused_parts_are_left_out() -> None:
     rows, left_out = choose(load_settings("fast"), [])
-    assert left_out == {
-        **dict.fromkeys(["no-blend", "no-fit", "no-geometry", "no-increment", "no-mask"], "off already"),
-        "no-root": "the fast field has no such part",
-    }
-    shown = [
-        "full",
-        "no-deformation",
-        "no-eikonal",
-        "no-noise",
-        "no-opt",
-        "no-reconstruction",
-        "no-residual",
-        "no-segmentation",
-    ]
-    assert list(rows) == shown
+    off = [f"no-{name}" for name in ("blend", "fit", "geometry", "increment", "mask", "residual", "segmentation")]
+    assert left_out == dict.fromkeys(off, "off already") | {"no-root": "the fast field has no such part"}
+    assert list(rows) == ["full", "no-deformation", "no-eikonal", "no-noise", "no-opt", "no-reconstruction"]
 
 
 @pytest.mark.parametrize("preset", ["nerf", "idr", "neural-body", "nerfies"])
@@ -173,14 +161,14 @@ def test_the_table_equals_one_written_by_hand() -> None:
 def test_a_failed_row_holds_its_error_and_the_other_rows_are_computed(
     stages: list[TrainingSettings], tmp_path: Path
 ) -> None:
-    table = ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-noise", "no-residual", "no-segmentation"])
+    table = ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-noise", "no-opt", "no-reconstruction"])
     assert table == tmp_path / "store" / "ablations" / "ada-fast-part.md"
     result = json.loads(table.with_suffix(".json").read_text())
     rows = result["rows"]
-    assert list(rows) == ["full", "no-noise", "no-residual", "no-segmentation"]
+    assert list(rows) == ["full", "no-noise", "no-opt", "no-reconstruction"]
     assert rows["no-noise"] == {"error": "TrainingError: the surface is empty"}
-    assert rows["no-residual"] == {"error": "signed distance field: no surface in its box"}
-    assert [rows[name]["novel_view"]["psnr"] for name in ("full", "no-segmentation")] == [0.02, 0.0]
+    assert rows["no-opt"] == {"error": "signed distance field: no surface in its box"}
+    assert [rows[name]["novel_view"]["psnr"] for name in ("full", "no-reconstruction")] == [1.0, 0.0]
     assert rows["full"]["seconds"] == 61.7
     assert table.read_text() == as_markdown(result)
 
@@ -188,7 +176,7 @@ def test_a_failed_row_holds_its_error_and_the_other_rows_are_computed(
 def test_the_table_of_another_capture_with_the_same_name_is_kept(
     stages: list[TrainingSettings], tmp_path: Path
 ) -> None:
-    table = ablate.fn(tmp_path / "ada", "fast", tmp_path / "store", [], ["no-segmentation"])
+    table = ablate.fn(tmp_path / "ada", "fast", tmp_path / "store", [], ["no-reconstruction"])
     before, trained = table.read_text(), len(stages)
     with pytest.raises(InputError, match=f"ada-fast-part.md: is of {tmp_path}/ada, not of {tmp_path}/other"):
         ablate.fn(tmp_path / "other", "fast", tmp_path / "store", [], ["no-opt"])
@@ -197,10 +185,10 @@ def test_the_table_of_another_capture_with_the_same_name_is_kept(
 
 def test_a_method_without_novel_poses_has_no_scores_for_them(stages: list[TrainingSettings], tmp_path: Path) -> None:
     """The published method, trained on one frame."""
-    table = ablate.fn(tmp_path, "paper", tmp_path / "store", [], ["no-segmentation"])
+    table = ablate.fn(tmp_path, "paper", tmp_path / "store", [], ["no-reconstruction"])
     rows = json.loads(table.with_suffix(".json").read_text())["rows"]
     assert rows["full"]["novel_pose"]["reason"] == "H-NeRF's static network models one moment"
-    assert "| full | 0.02 / - / - / - |" in table.read_text()
+    assert "| full | 1.00 / - / - / - |" in table.read_text()
     expected = "no images of animated new poses: H-NeRF's static network models one moment"
     assert table.read_text().count("H-NeRF's static network") == table.read_text().count(f"- {expected}\n") == 1
 
@@ -219,7 +207,7 @@ def test_a_lost_worker_ends_the_command_and_finished_rows_are_kept(
     stages: list[TrainingSettings], tmp_path: Path
 ) -> None:
     with pytest.raises(LostWorkerError):
-        ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-opt", "no-eikonal", "no-residual"])
+        ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-opt", "no-eikonal", "no-reconstruction"])
     result = json.loads((tmp_path / "store" / "ablations" / "ada-fast-part.json").read_text())
     assert list(result["rows"]) == ["full", "no-opt"]
     assert len(stages) == 3
@@ -228,7 +216,7 @@ def test_a_lost_worker_ends_the_command_and_finished_rows_are_kept(
 def test_the_command_prints_the_table(
     stages: list[TrainingSettings], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--store", str(tmp_path / "store"), "--set", "training.losses.segmentation=12", "--only", "no-mask"]
+    options = ["--store", str(tmp_path / "store"), "--set", "training.losses.reconstruction=12", "--only", "no-mask"]
     assert main(["ablate", str(tmp_path), *options]) == 0
     shown = capsys.readouterr().out
     assert "| full | 12.00 / 12.00 / 12.00 / 12.00 |" in shown
