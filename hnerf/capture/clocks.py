@@ -7,13 +7,14 @@ t_own = (1 + drift_ppm / 10^6) t + offset_s.
 import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from hnerf.capture.footage import ImageFolder, Video, VideoFrame
+from hnerf.capture.footage import Footage, Video, VideoFrame
 from hnerf.capture.safe_io import path_in_capture, read_toml
 from hnerf.capture.timing import resample
 from hnerf.config import validated
@@ -46,7 +47,7 @@ class InStep:
     """Footage of one camera at the common instants, which are frame numbers of the slowest camera. own: the camera's
     own fractional frame number at each instant; fps: of the slowest camera, if its file states it."""
 
-    source: ImageFolder | Video
+    source: Footage
     own: dict[int, float]
     fps: float | None
 
@@ -60,23 +61,19 @@ class InStep:
         """Return the instants, ascending."""
         return tuple(sorted(self.own))
 
-    def recorded(self, instant: int) -> int:
-        """Return the camera's own frame that is nearest to an instant."""
+    def recorded(self, instants: Iterable[int]) -> dict[int, int]:
+        """Return the camera's own frame that is nearest to each of the instants."""
         frames = np.asarray(self.source.frames)
-        return int(frames[np.abs(frames - self.own[instant]).argmin()])
+        return {instant: int(frames[np.abs(frames - self.own[instant]).argmin()]) for instant in instants}
 
     def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
         """Yield the images nearest to the wanted instants, in ascending order. Raises InputError as the footage
         does."""
-        wanted = sorted(wanted)
-        nearest = {instant: self.recorded(instant) for instant in wanted}
-        images = self.source.read(sorted(set(nearest.values())))
-        image = next(images, None)
-        for instant in wanted:
-            while image is not None and image.frame != nearest[instant]:
-                image = next(images, None)
-            assert image is not None  # `read` yields every frame requested
-            yield VideoFrame(instant, image.rgb, image.file)
+        nearest = self.recorded(sorted(wanted))
+        images = self.source.read(set(nearest.values()))
+        for image, (_, instants) in zip(images, groupby(nearest, nearest.__getitem__), strict=True):
+            for instant in instants:
+                yield VideoFrame(instant, image.rgb, image.file)
 
     def resampled(self, people: np.ndarray) -> np.ndarray:
         """Return keypoints (own frames, people, K, 3) at the instants, interpolated between frames."""
@@ -104,14 +101,12 @@ def write_clocks(path: Path, clocks: Mapping[str, Clock]) -> None:
     replace_text(path, "# a camera's own time: (1 + drift_ppm / 1e6) t + offset_s\n\n" + "\n".join(tables))
 
 
-def in_step(
-    footage: dict[str, ImageFolder | Video], clocks: Mapping[str, Clock], fps: float
-) -> dict[str, ImageFolder | Video | InStep]:
+def in_step(footage: dict[str, Footage], clocks: Mapping[str, Clock], fps: float) -> dict[str, InStep]:
     """Return the footage of all cameras at common instants: the frames of the slowest camera that all cameras recorded.
     Of equally slow cameras, the first with evenly spaced frames is taken, so that its frame numbers tell the time.
 
-    The footage is returned unchanged if there are no clocks and no video states that its frames are unevenly spaced.
-    fps: of images without a rate of their own. Raises InputError if a clock is missing or the recordings do not
+    If there are no clocks and no video states that its frames are unevenly spaced, each camera's instants are its own
+    frames. fps: of images without a rate of their own. Raises InputError if a clock is missing or the recordings do not
     overlap.
     """
     times_s = {name: frame_times_s(one, fps) for name, one in footage.items()}
@@ -119,7 +114,7 @@ def in_step(
         isinstance(one, Video) and one.times_s and not _regular(times_s[name]) for name, one in footage.items()
     )
     if not clocks and (len(footage) == 1 or not uneven):
-        return dict(footage)
+        return {name: InStep(one, {frame: frame for frame in one.frames}, one.fps) for name, one in footage.items()}
     clocks = clocks or dict.fromkeys(footage, Clock())
     if missing := sorted(set(footage).difference(clocks)):
         raise InputError(f"{FILE}: camera {missing[0]} is missing; run `hnerf synchronise` again, or add it")
@@ -139,7 +134,7 @@ def in_step(
     }
 
 
-def warn_if_uneven(one: ImageFolder | Video) -> None:
+def warn_if_uneven(one: Footage) -> None:
     """Warn if the frames of a single video, which are treated as evenly spaced, are not."""
     if isinstance(one, Video) and one.times_s and (off_s := _unevenness_s(np.asarray(one.times_s))) > NOTICED_S:
         log.warning(
@@ -150,7 +145,7 @@ def warn_if_uneven(one: ImageFolder | Video) -> None:
         )
 
 
-def frame_times_s(footage: ImageFolder | Video, fps: float) -> np.ndarray:
+def frame_times_s(footage: Footage, fps: float) -> np.ndarray:
     """Return when each frame was recorded, in seconds on the camera's own clock: as a video states, else at an even
     rate."""
     if isinstance(footage, Video) and footage.times_s:

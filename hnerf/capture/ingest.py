@@ -101,7 +101,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         warn_if_uneven(*filmed.values())
     recorded, fps = _common_frames(footage), _frame_rate(folder, manifest.fps, filmed, footage)
     _check_subject(folder, manifest, {name: {*recorded, *filmed[name].frames} for name in cameras.train})
-    people = _people_in_step(layout, footage)
+    detected = {name: detections(layout, name, one.source) for name, one in footage.items()}
+    people = {name: footage[name].resampled(found) for name, found in detected.items() if found is not None}
     seen = [people[name] for name in cameras.train if name in people]
     occupied = recorded if manifest.frames else _frames_with_people(seen, recorded)
     frames = chosen_frames(folder, manifest, occupied, layout.novel_pose_share, settings.max_frames)
@@ -246,7 +247,7 @@ def _subject_point(
     return SubjectPoint((float(x), float(y)), point.camera, frame)
 
 
-def _common_frames(footage: dict[str, Footage | InStep]) -> tuple[int, ...]:
+def _common_frames(footage: dict[str, InStep]) -> tuple[int, ...]:
     """Return the frames of all cameras. Raises InputError if cameras differ in frames or frame rate."""
     (first_name, first), *others = footage.items()
     for _, other in others:
@@ -264,9 +265,7 @@ def _common_frames(footage: dict[str, Footage | InStep]) -> tuple[int, ...]:
     return first.frames
 
 
-def _frame_rate(
-    folder: Path, stated: float | None, filmed: dict[str, Footage], footage: dict[str, Footage | InStep]
-) -> float:
+def _frame_rate(folder: Path, stated: float | None, filmed: dict[str, Footage], footage: dict[str, InStep]) -> float:
     """Return the frame rate of the common frames.
 
     A rate stated in `capture.toml` applies to images, and overrides one that all videos share (slow motion). If rates
@@ -285,7 +284,7 @@ def _frame_rate(
 
 
 def _write_cameras(
-    layout: Layout, lenses: dict[str, Lens], footage: dict[str, Footage | InStep], frames: tuple[int, ...],
+    layout: Layout, lenses: dict[str, Lens], footage: dict[str, InStep], frames: tuple[int, ...],
     settings: CaptureSettings, out: Path,
 ) -> tuple[dict[str, Normaliser], dict[str, Area]]:  # fmt: skip
     """Write the images of every camera; return their normalisers, and the areas that calibrated pictures fill where
@@ -310,12 +309,14 @@ def _write_given_poses(folder: Path, layout: Layout, frames: tuple[int, ...], ou
 
 
 def _write_pixels(
-    layout: Layout, lens: Lens, footage: Footage | InStep, frames: tuple[int, ...], settings: CaptureSettings, out: Path
+    layout: Layout, lens: Lens, footage: InStep, frames: tuple[int, ...], settings: CaptureSettings, out: Path
 ) -> Normaliser:
     """Write images, masks and clean plate of one camera, all of the first image's size."""
     normaliser: Normaliser | None = None
-    masks = layout.mask_files(lens.name)
-    mask_paths = _mask_paths(masks, frames, footage) if masks else {}
+    if masks := layout.mask_files(lens.name):
+        own = footage.recorded(frames)
+        found = _per_frame(masks, tuple(own.values()), footage.source.frames, "masks")
+        masks = {frame: found[own[frame]] for frame in frames}
     brightest = 0
     for picture in tracked(footage.read(frames), f"camera {lens.name}", len(frames)):
         source = picture.file or footage.path
@@ -328,8 +329,8 @@ def _write_pixels(
     if brightest <= BLACK:
         raise InputError(f"{footage.path}: all pictures are black; record again, or leave camera {lens.name} out")
     assert normaliser is not None  # a split has at least one training frame
-    if mask_paths:
-        _write_masks(normaliser, mask_paths, out / "masks" / lens.name)
+    if masks:
+        _write_masks(normaliser, masks, out / "masks" / lens.name)
     plate = layout.plate_file(lens.name)
     if plate:
         normaliser.write_image(read_image(plate), plate, plate, out / "background" / lens.name)
@@ -353,17 +354,6 @@ def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> No
             f"{footage}: by the distortion of camera {lens.name}, {1 - kept:.0%} of the picture was never recorded; "
             "calibrate it again"
         )
-
-
-def _mask_paths(
-    masks: dict[int, Path | StoredFrame], frames: tuple[int, ...], footage: Footage | InStep
-) -> dict[int, Path | StoredFrame]:
-    """Return the masks of the wanted frames. Raises InputError if there is not one for every recorded frame."""
-    if not isinstance(footage, InStep):
-        return _per_frame(masks, frames, footage.frames, "masks")
-    recorded = {frame: footage.recorded(frame) for frame in frames}
-    found = _per_frame(masks, tuple(set(recorded.values())), footage.source.frames, "masks")
-    return {frame: found[own] for frame, own in recorded.items()}
 
 
 def lens_as_recorded(lens: Lens, footage: Footage | InStep, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
@@ -402,16 +392,6 @@ def _per_frame(
         if frame not in files:
             raise InputError(f"{place}: {what} of frame {frame} missing; give one for each image, of its number")
     return {frame: files[frame] for frame in wanted}
-
-
-def _people_in_step(layout: Layout, footage: dict[str, Footage | InStep]) -> dict[str, np.ndarray]:
-    """Return the `detections` of each camera that has some, at the common instants."""
-    people = {}
-    for camera, recording in footage.items():
-        found = detections(layout, camera, recording.source if isinstance(recording, InStep) else recording)
-        if found is not None:
-            people[camera] = recording.resampled(found) if isinstance(recording, InStep) else found
-    return people
 
 
 def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
