@@ -174,16 +174,6 @@ def _reconstructed(kind: Any, *_: Any) -> _StandIn:
     return kind()
 
 
-def _encoded(text: str, encoding: str) -> bytes:
-    """Encode text as _codecs.encode does, which Python 3 uses to write bytes for Python 2."""
-    return text.encode("latin1")
-
-
-def _unhashed(items: Any) -> Any:
-    """Return the items of a set unhashed: no set is used, and tuples with shared parts can take forever to hash."""
-    return items
-
-
 def _with_keys(code: bytes, keys: slice) -> Callable[[Any], None]:
     """Return an opcode's handler that loads dictionary items but refuses tuples as keys. keys: their slice of the
     stack."""
@@ -204,14 +194,14 @@ def _refused(unpickler: Any) -> None:
 _ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "dtype"): _Dtype,
     ("numpy", "ndarray"): _Array,
-    ("_codecs", "encode"): _encoded,
+    ("_codecs", "encode"): lambda text, _: text.encode("latin1"),  # as Python 3 writes bytes for Python 2
     ("__builtin__", "bytes"): lambda: b"",  # without arguments, as Python 3 writes empty bytes for Python 2
     ("copy_reg", "_reconstructor"): _reconstructed,
     ("copyreg", "_reconstructor"): _reconstructed,
     ("__builtin__", "object"): object,
     ("builtins", "object"): object,
-    ("__builtin__", "set"): _unhashed,
-    ("builtins", "set"): _unhashed,
+    # A set's items unhashed: no set is used, and tuples with shared parts can take forever to hash.
+    **{(module, "set"): lambda items: items for module in ("__builtin__", "builtins")},
     ("chumpy.ch", "Ch"): _Chumpy,
     **{(module, "_reconstruct"): _reconstructed for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
     **{(module, "_frombuffer"): _Buffer for module in ("numpy.core.numeric", "numpy._core.numeric")},
