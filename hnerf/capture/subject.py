@@ -47,17 +47,13 @@ def ranked_people(capture: Capture) -> list[PersonTrack]:
         if not np.isfinite(distances[order[0]]):
             raise InputError(f"{capture.name}: capture.toml: subject: nobody is found there; name another point")
         return [tracks[i] for i in order]
-    ranked = sorted(tracks, key=lambda track: (track.moves, track.claim), reverse=True)
-    if len(ranked) > 1 and _equal(*ranked[:2]):
+    first, *others = sorted(tracks, key=lambda track: (track.moves, track.claim), reverse=True)
+    if others and others[0].moves == first.moves and others[0].claim > EQUAL_CLAIM * first.claim:
         raise InputError(
-            f"{capture.name}: two people have an equal claim to be the subject, {_place(capture, *ranked[:2])}; name "
-            'one in capture.toml, as subject = "nearest to (x, y) in CAMERA at frame N"'
+            f"{capture.name}: two people have an equal claim to be the subject, {_place(capture, first, others[0])}; "
+            'name one in capture.toml, as subject = "nearest to (x, y) in CAMERA at frame N"'
         )
-    return ranked
-
-
-def _equal(first: PersonTrack, second: PersonTrack) -> bool:
-    return first.moves == second.moves and second.claim > EQUAL_CLAIM * first.claim
+    return [first, *others]
 
 
 def _detected(capture: Capture) -> list[np.ndarray]:
