@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from hnerf.synthetic.dressed import GARMENTS
-
 ROOM_HALF_SIDE_M = 4.2
 ROOM_HEIGHT_M = 3.2
 FACE = (15, 16, 0)  # BODY_25: right eye, left eye, nose
@@ -15,15 +13,11 @@ def person_colour(face_m: np.ndarray, rest_m: np.ndarray, depths_m: np.ndarray) 
 
     face_m (3, 3): the rest body's keypoints FACE.
     """
-    garment_index = depths_m.argmax(1)
-    painters = {"shirt": _shirt, "trousers": _trousers, "shoes": _shoes, "hair": _hair}
-    colour = np.empty_like(rest_m)
-    for index, garment in enumerate(GARMENTS):
-        here = garment_index == index
-        if garment == "skin":
-            colour[here] = _skin(face_m, rest_m[here])
-        else:
-            colour[here] = painters[garment](rest_m[here], depths_m[here, index])
+    deepest, colour = depths_m.argmax(1), np.empty_like(rest_m)
+    painters = (lambda p, _: _skin(face_m, p), _shirt, _trousers, _shoes, _hair)  # in the order of depths_m
+    for garment, paint in enumerate(painters):
+        here = deepest == garment
+        colour[here] = paint(rest_m[here], depths_m[here, garment])
     return colour
 
 

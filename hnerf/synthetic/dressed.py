@@ -13,7 +13,6 @@ from torch import Tensor
 from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig, joint_transforms, skinning_transforms
 
-GARMENTS = ("skin", "shirt", "trousers", "shoes", "hair")
 SMOOTHING_STEPS = 30
 HEM_BELOW_HIPS_M = 0.10
 SLEEVE_LENGTH = 0.7  # of the upper arm
@@ -27,8 +26,9 @@ class DressedBody:
     3): smoothed under cloth.
 
     faces (F, 3); edges (E, 2): body vertices whose midpoints were added; weights (V, J): dense skinning weights.
-    depths_m (V, 5): metres inside each garment's outline in the order of GARMENTS, negative outside; skin is 0, so that
-    the deepest garment is the visible one. outward (V, 3): smoothed normals. fold_phases (8,): where the folds lie.
+    depths_m (V, 5): metres inside the outlines of skin, shirt, trousers, shoes and hair, negative outside; skin is 0,
+    so that the deepest garment is the visible one. outward (V, 3): smoothed normals. fold_phases (8,): where the folds
+    lie.
     """
 
     rig: Rig
