@@ -17,26 +17,34 @@ from hnerf.errors import InputError
 from tests.capture import recordings as rec
 from tests.capture.test_safe_pickle import Bomb
 
-
-def _edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
+Damage = Callable[[Path], object]
+KEYPOINTS, TABLES = "openpose/01/000001_keypoints.json", "calibration/Calib.toml"
 
 
-def _nan_keypoint(folder: Path) -> None:
-    points = np.full((25, 3), 0.5).tolist()
-    points[3][0] = float("nan")
-    rec.write_keypoints(folder / "openpose/01/000001_keypoints.json", [points])
+def _edited(name: str, old: str, new: str) -> Damage:
+    """Return the damage of replacing a text in a file."""
+
+    def damage(folder: Path) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+
+    return damage
 
 
-def _far_shoulder(folder: Path) -> None:
+def _written(name: str, content: str | bytes) -> Damage:
+    """Return the damage of another content of a file."""
+    return lambda folder: (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def _shoulder(*point: float) -> Damage:
+    """Return the damage of one keypoint in another place."""
     points = np.full((25, 3), 0.5)
-    points[2] = 1e308, 1e308, 1
-    rec.write_keypoints(folder / "openpose/01/000001_keypoints.json", [points])
+    points[2] = point
+    return lambda folder: rec.write_keypoints(folder / KEYPOINTS, [points])
 
 
-def _scale_keypoints(factor: float) -> Callable[[Path], object]:
+def _scale_keypoints(factor: float) -> Damage:
     def damage(folder: Path) -> None:
         for path in (folder / "openpose/01").iterdir():
             rec.write_keypoints(path, [factor * np.tile([7.0, 5.0, 0.1], (25, 1))])
@@ -68,8 +76,8 @@ def _file_in_place_of(folder: Path) -> None:
     folder.write_text("not a folder")
 
 
-def _toml(text: str) -> Callable[[Path], object]:
-    return lambda folder: (folder / "capture.toml").write_text(text)
+def _toml(text: str) -> Damage:
+    return _written("capture.toml", text)
 
 
 def _call_a_camera_file(folder: Path) -> None:
@@ -79,37 +87,34 @@ def _call_a_camera_file(folder: Path) -> None:
 
 EASYMOCAP = {
     "extri missing": (lambda f: (f / "extri.yml").unlink(), "extri.yml"),
-    "intri is a pickle": (lambda f: (f / "intri.yml").write_bytes(pickle.dumps(Bomb())), "intri.yml"),
-    "intri is an ASCII pickle": (lambda f: (f / "intri.yml").write_bytes(pickle.dumps(Bomb(), 0)), "intri.yml"),
-    "intri is deeply nested": (lambda f: (f / "intri.yml").write_text("%YAML:1.0\n---\na: " + "[" * 5000), "intri.yml"),
-    "NaN in K": (lambda f: _edit(f / "intri.yml", "20.", ".Nan"), "intri.yml: K_01"),
-    "NaN in T": (lambda f: _edit(f / "extri.yml", "data: [ 0., 1., 3. ]", "data: [ .Nan, 1., 3. ]"), "extri.yml: T_01"),
-    "plain nan in K": (lambda f: _edit(f / "intri.yml", "20.", "nan"), "intri.yml: camera 01: K"),
-    "zero focal length in K": (lambda f: _edit(f / "intri.yml", "20.", "0."), "intri.yml"),
+    "intri is a pickle": (_written("intri.yml", pickle.dumps(Bomb())), "intri.yml"),
+    "intri is an ASCII pickle": (_written("intri.yml", pickle.dumps(Bomb(), 0)), "intri.yml"),
+    "intri is deeply nested": (_written("intri.yml", "%YAML:1.0\n---\na: " + "[" * 5000), "intri.yml"),
+    "NaN in K": (_edited("intri.yml", "20.", ".Nan"), "intri.yml: K_01"),
+    "NaN in T": (_edited("extri.yml", "data: [ 0., 1., 3. ]", "data: [ .Nan, 1., 3. ]"), "extri.yml: T_01"),
+    "plain nan in K": (_edited("intri.yml", "20.", "nan"), "intri.yml: camera 01: K"),
+    "zero focal length in K": (_edited("intri.yml", "20.", "0."), "intri.yml"),
     "aliases in intri": (
-        lambda f: _edit(f / "intri.yml", "names:", f"a: &a [{'x,' * 9}]\nb: &b [{'*a,' * 9}]\nnames: [*b]\nc:"),
+        _edited("intri.yml", "names:", f"a: &a [{'x,' * 9}]\nb: &b [{'*a,' * 9}]\nnames: [*b]\nc:"),
         "intri.yml: not an OpenCV YAML file (aliases",
     ),
-    "key twice in intri": (lambda f: _edit(f / "intri.yml", "names:", "W_01: 12\nnames:"), "there twice"),
-    "camera names that are lists": (
-        lambda f: _edit(f / "intri.yml", '"01"', '["01"]'),
-        "intri.yml: camera name that is no",
-    ),
+    "key twice in intri": (_edited("intri.yml", "names:", "W_01: 12\nnames:"), "there twice"),
+    "camera names that are lists": (_edited("intri.yml", '"01"', '["01"]'), "intri.yml: camera name that is no"),
     "camera name with a terminal escape sequence": (
-        lambda f: _edit(f / "intri.yml", '"01"', f'"\\e[2J{"a" * 500}"'),
+        _edited("intri.yml", '"01"', f'"\\e[2J{"a" * 500}"'),
         "intri.yml: camera name '\\x1b[2Jaaaa",
     ),
-    "camera named twice": (lambda f: _edit(f / "intri.yml", '"02"', '"01"'), "two cameras are called 01"),
-    "T of 1e30": (lambda f: _edit(f / "extri.yml", "data: [ 0., 1., 3. ]", "data: [ 1e30, 1., 3. ]"), "T holds 1e+30"),
+    "camera named twice": (_edited("intri.yml", '"02"', '"01"'), "two cameras are called 01"),
+    "T of 1e30": (_edited("extri.yml", "data: [ 0., 1., 3. ]", "data: [ 1e30, 1., 3. ]"), "T holds 1e+30"),
     "distortion beyond any lens": (
         lambda f: rec.write_calibration(f, (1e8, 0, 0, 0, 0)),
         "images/01: by the distortion of camera 01",
     ),
-    "camera not in extri": (lambda f: _edit(f / "extri.yml", "T_02", "T_03"), "extri.yml: T_02"),
-    "matrix of a billion rows": (lambda f: _edit(f / "intri.yml", "rows: 3", "rows: 1000000000"), "intri.yml: K_01"),
-    "matrix shorter than declared": (lambda f: _edit(f / "intri.yml", "cols: 3", "cols: 5"), "intri.yml: K_01"),
+    "camera not in extri": (_edited("extri.yml", "T_02", "T_03"), "extri.yml: T_02"),
+    "matrix of a billion rows": (_edited("intri.yml", "rows: 3", "rows: 1000000000"), "intri.yml: K_01"),
+    "matrix shorter than declared": (_edited("intri.yml", "cols: 3", "cols: 5"), "intri.yml: K_01"),
     "intri of a gigabyte": (lambda f: os.truncate(f / "intri.yml", 10**9), "intri.yml"),
-    "camera name leaves the folder": (lambda f: _edit(f / "intri.yml", '"01"', '"../01"'), "intri.yml"),
+    "camera name leaves the folder": (_edited("intri.yml", '"01"', '"../01"'), "intri.yml"),
     "camera named like an argument of np.savez": (_call_a_camera_file, "intri.yml: a camera cannot be"),
     "camera without a folder": (lambda f: (f / "images/02").rename(f / "images/03"), "images/02"),
     "camera without images": (
@@ -118,7 +123,7 @@ EASYMOCAP = {
     ),
     "unequal frame counts": (lambda f: (f / "images/02/000002.png").unlink(), "02: 4 frames, but camera 01 has 5"),
     "frame without a number": (lambda f: (f / "images/01/000001.png").rename(f / "images/01/a.png"), "images/01/a.png"),
-    "unreadable image": (lambda f: (f / "images/01/000001.png").write_bytes(b"nothing"), "images/01/000001.png"),
+    "unreadable image": (_written("images/01/000001.png", b"nothing"), "images/01/000001.png"),
     "image cut short": (lambda f: os.truncate(f / "images/01/000001.png", 700), "images/01/000001.png"),
     "all images are black": (
         lambda f: [write_image(p, np.full((16, 24, 3), 5, np.uint8)) for p in (f / "images/02").iterdir()],
@@ -129,10 +134,7 @@ EASYMOCAP = {
         lambda f: write_image(f / "images/01/000002.png", np.zeros((8, 8, 3), np.uint8)),
         "images/01/000002.png: is 8 x 8 px",
     ),
-    "calibrated at another size": (
-        lambda f: _edit(f / "intri.yml", "W_02: 24", "W_02: 32"),
-        "24 x 16 px, but camera 02",
-    ),
+    "calibrated at another size": (_edited("intri.yml", "W_02: 24", "W_02: 32"), "24 x 16 px, but camera 02"),
     "two plates of one camera": (
         lambda f: [write_image(f / "background" / name, rec.picture("01", 0)) for name in ("01.jpg", "01.png")],
         "background/01.png: camera 01 is also 01.jpg; keep one of them",
@@ -145,49 +147,40 @@ EASYMOCAP = {
         lambda f: write_image(f / "masks/01/000002.png", np.zeros((16, 24, 3), np.uint8)),
         "masks/01: 1 masks for 5 frames",
     ),
-    "empty keypoint file": (
-        lambda f: (f / "openpose/01/000001_keypoints.json").write_text(""),
-        "000001_keypoints.json: is empty",
-    ),
+    "empty keypoint file": (_written(KEYPOINTS, ""), "000001_keypoints.json: is empty"),
     "keypoint file missing": (
-        lambda f: (f / "openpose/01/000001_keypoints.json").unlink(),
+        lambda f: (f / KEYPOINTS).unlink(),
         "openpose/01: 4 keypoints for 5 frames; give one for each (an empty list of people where nobody is seen)",
     ),
-    "keypoints are a pickle": (
-        lambda f: (f / "openpose/01/000001_keypoints.json").write_bytes(pickle.dumps(Bomb())),
-        "000001_keypoints.json",
-    ),
+    "keypoints are a pickle": (_written(KEYPOINTS, pickle.dumps(Bomb())), "000001_keypoints.json"),
     "keypoints are an archive": (
-        lambda f: np.savez(open(f / "openpose/01/000001_keypoints.json", "wb"), a=1),  # noqa: SIM115
+        lambda f: np.savez(open(f / KEYPOINTS, "wb"), a=1),  # noqa: SIM115
         "000001_keypoints.json",
     ),
     "keypoints of another model": (
-        lambda f: rec.write_keypoints(f / "openpose/01/000001_keypoints.json", [np.zeros((18, 3))]),
+        lambda f: rec.write_keypoints(f / KEYPOINTS, [np.zeros((18, 3))]),
         "000001_keypoints.json",
     ),
     "keypoint with too many digits": (
-        lambda f: _edit(f / "openpose/01/000001_keypoints.json", "4.0", "9" * 400),
+        _edited(KEYPOINTS, "4.0", "9" * 400),
         "000001_keypoints.json: keypoints are not triples of numbers",
     ),
-    "keypoints are deeply nested": (
-        lambda f: (f / "openpose/01/000001_keypoints.json").write_text("[" * 100_000),
-        "000001_keypoints.json",
-    ),
+    "keypoints are deeply nested": (_written(KEYPOINTS, "[" * 100_000), "000001_keypoints.json"),
     "keypoints as fractions of the image size": (
         _scale_keypoints(0.1),
         "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to",
     ),
     "keypoints as fractions of the image size, one below the border": (
-        lambda f: [_scale_keypoints(0.1)(f), _edit(f / "openpose/01/000001_keypoints.json", "0.5", "1.02")],
+        lambda f: [_scale_keypoints(0.1)(f), _edited(KEYPOINTS, "0.5", "1.02")(f)],
         "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to 1.02 are not in the pixels",
     ),
     "keypoints of larger images": (_scale_keypoints(4), "not in the pixels of pictures of 24 x 16"),
-    "keypoint whose mean with another overflows": (_far_shoulder, "000001_keypoints.json: a keypoint is beyond 1e+06"),
-    "NaN keypoint": (_nan_keypoint, "000001_keypoints.json"),
-    "a thousand people": (
-        lambda f: (f / "openpose/01/000001_keypoints.json").write_text(json.dumps({"people": [{}] * 1000})),
-        "1000 people",
+    "keypoint whose mean with another overflows": (
+        _shoulder(1e308, 1e308, 1),
+        "000001_keypoints.json: a keypoint is beyond 1e+06",
     ),
+    "NaN keypoint": (_shoulder(np.nan, 0.5, 0.5), "000001_keypoints.json"),
+    "a thousand people": (_written(KEYPOINTS, json.dumps({"people": [{}] * 1000})), "1000 people"),
     "file in place of the keypoints' folder": (
         lambda f: _file_in_place_of(f / "openpose"),
         "openpose: is a file where a folder belongs",
@@ -221,21 +214,15 @@ EASYMOCAP = {
     "toml with unknown units": (_toml('units = "inch"\n'), "units"),
     "toml with a mistyped table": (_toml('[Camera]\ntrain = ["01"]\n'), "Camera has no meaning; did you mean cameras?"),
     "toml with a mistyped key": (_toml('unit = "mm"\n'), "unit has no meaning; did you mean units?"),
-    "toml in another encoding": (lambda f: (f / "capture.toml").write_bytes(b'name = "J\xfcrgen"'), "is not UTF-8"),
+    "toml in another encoding": (_written("capture.toml", b'name = "J\xfcrgen"'), "is not UTF-8"),
     "toml name too long for a folder": (_toml(f'name = "{100 * "张"}"\n'), "name of 300 bytes"),
     "toml with an infinite unit": (_toml("units = inf\n"), 'units: give "m", "mm", or a number'),
     "toml with an unknown camera": (_toml('[cameras]\ntrain = ["01", "07"]\n'), "camera 07"),
     "toml with a camera twice": (_toml('[cameras]\ntrain = ["01"]\ntest = ["01"]\n'), "named twice"),
     "toml with an unknown frame": (_toml("[frames]\ntrain = [0, 5]\n"), "frame 5"),
     "toml without training frames": (_toml("[frames]\ntrain = []\n"), "frames.train"),
-    "toml with a subject that cannot be read": (
-        _toml('subject = "nearest (1, 2)"\n'),
-        'subject: write "near',
-    ),
-    "toml with a subject too far away": (
-        _toml(f'subject = "nearest to ({"9" * 400}, 1)"\n'),
-        'subject: write "near',
-    ),
+    "toml with a subject that cannot be read": (_toml('subject = "nearest (1, 2)"\n'), 'subject: write "near'),
+    "toml with a subject too far away": (_toml(f'subject = "nearest to ({"9" * 400}, 1)"\n'), 'subject: write "near'),
     "toml with a subject in a frame that was not recorded": (
         _toml('subject = "nearest to (1, 2) in 01 at frame 999"\n'),
         "capture.toml: subject: frame 999 is none of the recording's frames 0 to 4; correct it",
@@ -253,31 +240,22 @@ EASYMOCAP = {
 }
 
 POSE2SIM = {
-    "no calibration file": (lambda f: (f / "calibration/Calib.toml").unlink(), "walker: 2 videos without calibration"),
-    "calibration is a pickle": (
-        lambda f: (f / "calibration/Calib.toml").write_bytes(pickle.dumps(Bomb())),
-        "Calib.toml",
-    ),
-    "NaN": (lambda f: _edit(f / "calibration/Calib.toml", "50.0", "nan"), "Calib.toml: camera cam01: K"),
-    "key missing": (
-        lambda f: _edit(f / "calibration/Calib.toml", "rotation", "rot"),
-        "Calib.toml: camera cam01: 'rotation'",
-    ),
-    "camera is not a table": (
-        lambda f: _edit(f / "calibration/Calib.toml", "[cam01]", "cam03 = 1\n[cam01]"),
-        "camera cam03",
-    ),
+    "no calibration file": (lambda f: (f / TABLES).unlink(), "walker: 2 videos without calibration"),
+    "calibration is a pickle": (_written(TABLES, pickle.dumps(Bomb())), "Calib.toml"),
+    "NaN": (_edited(TABLES, "50.0", "nan"), "Calib.toml: camera cam01: K"),
+    "key missing": (_edited(TABLES, "rotation", "rot"), "Calib.toml: camera cam01: 'rotation'"),
+    "camera is not a table": (_edited(TABLES, "[cam01]", "cam03 = 1\n[cam01]"), "camera cam03"),
     "two cameras of one name": (
-        lambda f: _edit(f / "calibration/Calib.toml", 'name = "cam02"', 'name = "cam01"'),
+        _edited(TABLES, 'name = "cam02"', 'name = "cam01"'),
         "Calib.toml: two cameras are called cam01",
     ),
-    "fisheye": (lambda f: _edit(f / "calibration/Calib.toml", "fisheye = false", "fisheye = true"), "fisheye"),
+    "fisheye": (_edited(TABLES, "fisheye = false", "fisheye = true"), "fisheye"),
     "video missing": (lambda f: (f / "videos/cam02.mp4").unlink(), "videos/cam02.mp4"),
     "two videos of one camera": (
         lambda f: shutil.copy(f / "videos/cam02.mp4", f / "videos/cam02.MOV"),
         "videos/cam02.mp4: camera cam02 is also cam02.MOV; keep one of them",
     ),
-    "video is not a video": (lambda f: (f / "videos/cam02.mp4").write_bytes(b"0" * 100), "videos/cam02.mp4"),
+    "video is not a video": (_written("videos/cam02.mp4", b"0" * 100), "videos/cam02.mp4"),
     "video is a playlist of other files": (
         lambda f: [
             (f / "videos/cam02.mp4").rename(f / "videos/cam02"),
@@ -328,7 +306,7 @@ def _refused(folder: Path, tmp_path: Path, names: str) -> None:
 )
 def test_a_damaged_recording_is_refused(
     write: Callable[[Path], Path],
-    damage: Callable[[Path], object],
+    damage: Damage,
     names: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
