@@ -1,7 +1,6 @@
 """The synthetic capture: its ground truth is consistent, and its clothes go beyond the body model."""
 
 import hashlib
-import json
 from pathlib import Path
 
 import cv2
@@ -107,7 +106,7 @@ def test_keypoints_are_noisy_but_right(folder: Path, capture: Capture) -> None:
     errors_px = []
     for camera in capture.cameras.values():
         keypoints = capture.keypoints(camera.name)
-        assert keypoints is not None
+        assert keypoints is not None and keypoints.shape == (2, 1, 25, 3)
         seen = keypoints[:, 0, :, 2] > 0.5
         errors_px.append(np.linalg.norm(keypoints[:, 0, :, :2] - camera.project(exact_m)[0], axis=-1)[seen])
     assert 0.9 * 0.375 < np.median(np.concatenate(errors_px)) < 1.5 * 0.375
@@ -168,8 +167,3 @@ def test_irradiance_and_floor_shadow_under_an_open_sky() -> None:
     assert floor_shadow(roof, np.zeros(3), lights).min() < 0.2
     nothing = mesh_on_cpu(np.array([[0.0, 0, -5], [1, 0, -5], [0, 1, -5]]), np.array([[0, 1, 2]]))
     assert floor_shadow(nothing, np.zeros(3), lights).min() == pytest.approx(1.0)
-
-
-def test_keypoints_are_written_as_openpose_files(folder: Path) -> None:
-    stored = json.loads((folder / "openpose" / "01" / "000000_keypoints.json").read_text())
-    assert len(stored["people"]) == 1 and len(stored["people"][0]["pose_keypoints_2d"]) == 75
