@@ -23,7 +23,8 @@ def shown_frames(path: Path, samples: int) -> int:
     videos = [track for track in tracks if track.get(b"hdlr", b"")[8:12] == b"vide"]
     try:
         track = next(one for one in videos if _number(one[b"stsz"][8:12]) == samples)
-        return _within(_edits(dict(movie)[b"mvhd"], track), _shown_at(track, samples))
+        edits, shown_at = _edits(dict(movie)[b"mvhd"], track), _shown_at(track, samples)
+        return sum(int(np.subtract(*np.searchsorted(shown_at, (end, begin)))) for begin, end in edits)
     except (LookupError, StopIteration, ValueError, ZeroDivisionError, struct.error):
         return samples
 
@@ -62,10 +63,6 @@ def _expanded(table: bytes, number: str, samples: int) -> np.ndarray:
     if runs["count"].sum(dtype=np.int64) != samples:
         raise ValueError("another number of samples")
     return np.repeat(runs["number"].astype(np.int64), runs["count"])
-
-
-def _within(edits: list[tuple[int, int]], shown_at: np.ndarray) -> int:
-    return sum(int(np.subtract(*np.searchsorted(shown_at, (end, begin)))) for begin, end in edits)
 
 
 def _time_scale(header: bytes) -> int:
