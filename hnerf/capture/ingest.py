@@ -21,7 +21,7 @@ from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.videos import Videos
 from hnerf.capture.formats.zjumocap import ZjuMocap
-from hnerf.capture.keypoint_files import read_openpose, read_results
+from hnerf.capture.keypoint_files import pad_people, read_openpose, read_results
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import (
@@ -412,13 +412,10 @@ def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | No
     else:
         return None
     count = next((p.shape[1] for p in people if len(p)), 0)
-    stacked = np.zeros((len(people), max(1, *(len(p) for p in people)), count, 3))
-    for path, row, points in zip(paths, stacked, people, strict=True):
-        if len(points) == 0:
-            continue
-        if points.shape[1] != count:
+    for path, points in zip(paths, people, strict=True):
+        if len(points) and points.shape[1] != count:
             raise InputError(f"{path}: {points.shape[1]} keypoints a person where others have {count}; detect again")
-        row[: len(points)] = points
+    stacked = pad_people([points.reshape(len(points), count, 3) for points in people])
     place = paths[0] if len(set(paths)) == 1 else paths[0].parent
     _check_in_pixels(place, stacked[stacked[..., 2] > 0][:, :2], next(footage.read(recorded[:1])))
     return stacked

@@ -102,3 +102,12 @@ def without_far_points(path: Path, points: np.ndarray) -> np.ndarray:
     if (points[far][:, 2] > 0).any():
         raise InputError(f"{path}: a keypoint is beyond {MAX_PX:g} px; detect them again")
     return np.where(far[..., None], 0.0, points)
+
+
+def pad_people(people: list[np.ndarray]) -> np.ndarray:
+    """Stack each frame's array of its people, (P, ...), as (frames, most people, ...); absent people are 0."""
+    most = max(1, *(len(found) for found in people))
+    rows = np.zeros((len(people), most, *people[0].shape[1:]), people[0].dtype)
+    for row, found in zip(rows, people, strict=True):
+        row[: len(found)] = found
+    return rows

@@ -17,12 +17,13 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import KEYPOINTS, LANDMARKS, PERSON, Capture, write_image
+from hnerf.capture.keypoint_files import pad_people
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.subject import ranked_people
 from hnerf.capture.subset import write_points
 from hnerf.config import DetectionSettings
 from hnerf.detection.landmarks import POINTS, SIZE, LandmarkNetwork, Person
-from hnerf.detection.merge import fill_missing, pad_people
+from hnerf.detection.merge import fill_missing
 from hnerf.detection.people import PICTURE, REPORT, check_subject, draw_people, keep_subject, people_rows
 from hnerf.detection.person_detector import PersonDetector
 from hnerf.detection.tracker import track
@@ -68,7 +69,7 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
         keep_subject(out, capture, name, subject, people[name], _load(out, name, "masks", "regions"))
     draw_people(out / PICTURE, detected, ranked)
     cameras = {name: _summary(people) for name, people in found.items()}
-    report = {"cameras": cameras, "people": people_rows(detected, ranked)}
+    report = {"cameras": cameras, "people": people_rows(ranked)}
     (out / REPORT).write_text(json.dumps(report, indent=1))
     return report | {"ms": ms}
 

@@ -30,12 +30,3 @@ def nearest_person(person: np.ndarray, others: np.ndarray) -> int | None:
             if distance <= nearest:
                 best, nearest = i, distance
     return best
-
-
-def pad_people(people: list[np.ndarray]) -> np.ndarray:
-    """Stack each frame's array of its people, (P, ...), as (frames, most people, ...); absent people are 0."""
-    most = max(1, *(len(found) for found in people))
-    rows = np.zeros((len(people), most, *people[0].shape[1:]), people[0].dtype)
-    for row, found in zip(rows, people, strict=True):
-        row[: len(found)] = found
-    return rows

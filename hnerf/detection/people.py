@@ -67,7 +67,7 @@ def _pasted(found: dict[str, np.ndarray], row: int, person: int, size_px: tuple[
     return region.paste(found["masks"][row, person].astype(np.float32), size_px)
 
 
-def people_rows(capture: Capture, people: list[PersonTrack]) -> list[dict[str, Any]]:
+def people_rows(people: list[PersonTrack]) -> list[dict[str, Any]]:
     """Return the report's values for each person, the subject first."""
     rows = []
     for i, person in enumerate(people):

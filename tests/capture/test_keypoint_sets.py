@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.ingest import ingest
-from hnerf.capture.keypoint_files import read_openpose, read_results
+from hnerf.capture.keypoint_files import pad_people, read_openpose, read_results
 from hnerf.capture.keypoint_sets import SETS, KeypointSetName, is_body_25, to_body_25
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
@@ -125,6 +125,12 @@ def test_points_that_were_not_seen_may_have_any_position(tmp_path: Path) -> None
     (tmp_path / "a.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": found.ravel().tolist()}]}))
     found[5:7] = 0
     assert np.array_equal(read_openpose(tmp_path / "a.json")[0], found)
+
+
+def test_all_frames_are_padded_to_the_largest_number_of_people() -> None:
+    rows = pad_people([np.zeros((0, 25, 3)), np.ones((2, 25, 3))])
+    assert rows.shape == (2, 2, 25, 3) and rows[0].max() == 0 and rows[1].min() == 1
+    assert pad_people([np.zeros((0, 25, 3))]).shape == (1, 1, 25, 3)
 
 
 def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:

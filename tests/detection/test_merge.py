@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hnerf.detection.merge import fill_missing, nearest_person, pad_people
+from hnerf.detection.merge import fill_missing, nearest_person
 
 
 def person(x: float, confidence: float) -> np.ndarray:
@@ -40,9 +40,3 @@ def test_people_are_compared_at_keypoints_that_both_have() -> None:
 
 def test_without_recorded_keypoints_the_networks_person_is_used() -> None:
     assert fill_missing(np.zeros((1, 25, 3)), person(7, 0.6)[None]).tolist() == person(7, 0.6)[None].tolist()
-
-
-def test_all_frames_are_padded_to_the_largest_number_of_people() -> None:
-    rows = pad_people([np.zeros((0, 25, 3)), np.ones((2, 25, 3))])
-    assert rows.shape == (2, 2, 25, 3) and rows[0].max() == 0 and rows[1].min() == 1
-    assert pad_people([np.zeros((0, 25, 3))]).shape == (1, 1, 25, 3)
