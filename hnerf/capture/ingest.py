@@ -109,7 +109,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     wanted = tuple(sorted(frames.train + frames.novel_pose))
 
     out.mkdir(parents=True, exist_ok=True)
-    normalisers, areas = _write_cameras(layout, lenses, footage, wanted, settings, out)
+    written = {name: _write_camera(layout, lenses[name], one, wanted, settings, out) for name, one in footage.items()}
+    normalisers = {name: normaliser for name, (normaliser, _) in written.items()}
     rows = np.searchsorted(recorded, wanted)
     chosen = to_body_25({name: found[rows] for name, found in people.items()}, manifest.keypoints)
     write_points(out / KEYPOINTS, {name: normalisers[name].keypoints(points) for name, points in chosen.items()})
@@ -130,7 +131,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         up=manifest.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
-        picture_areas_px=areas,
+        picture_areas_px={name: area for name, (_, area) in written.items() if area},
         frame_step=median_step(recorded),
         subject_point=_subject_point(manifest, normalisers, wanted),
         stature_m=manifest.stature_m,
@@ -283,22 +284,6 @@ def _frame_rate(folder: Path, stated: float | None, filmed: dict[str, Footage], 
     return counted
 
 
-def _write_cameras(
-    layout: Layout, lenses: dict[str, Lens], footage: dict[str, InStep], frames: tuple[int, ...],
-    settings: CaptureSettings, out: Path,
-) -> tuple[dict[str, Normaliser], dict[str, Area]]:  # fmt: skip
-    """Write the images of every camera; return their normalisers, and the areas that calibrated pictures fill where
-    black bars prove it."""
-    normalisers: dict[str, Normaliser] = {}
-    areas: dict[str, Area] = {}
-    for name, recording in footage.items():
-        log.info("camera %s: %d frames from %s", name, len(frames), recording.path)
-        lens, area = lens_as_recorded(lenses[name], recording, frames)
-        areas |= {name: area} if area else {}
-        normalisers[name] = _write_pixels(layout, lens, recording, frames, settings, out)
-    return normalisers, areas
-
-
 def _write_given_poses(folder: Path, layout: Layout, frames: tuple[int, ...], out: Path) -> None:
     """Write the given poses, if the recording has any. Raises InputError if none of these frames has one."""
     poses = layout.given_poses(frames)
@@ -308,33 +293,32 @@ def _write_given_poses(folder: Path, layout: Layout, frames: tuple[int, ...], ou
         poses.save(out / "poses.npz")
 
 
-def _write_pixels(
+def _write_camera(
     layout: Layout, lens: Lens, footage: InStep, frames: tuple[int, ...], settings: CaptureSettings, out: Path
-) -> Normaliser:
-    """Write images, masks and clean plate of one camera, all of the first image's size."""
-    normaliser: Normaliser | None = None
+) -> tuple[Normaliser, Area | None]:
+    """Write images, masks and clean plate of one camera, all of the first image's size. Return its normaliser, and the
+    area that the calibrated picture fills if black bars prove it."""
+    log.info("camera %s: %d frames from %s", lens.name, len(frames), footage.path)
+    lens, area, size_px = lens_as_recorded(lens, footage, frames)
+    _check_distortion(footage.path, lens, size_px)
+    normaliser = Normaliser.create(lens, size_px, settings.max_side_px)
     if masks := layout.mask_files(lens.name):
         own = footage.recorded(frames)
         found = _per_frame(masks, tuple(own.values()), footage.source.frames, "masks")
         masks = {frame: found[own[frame]] for frame in frames}
     brightest = 0
     for picture in tracked(footage.read(frames), f"camera {lens.name}", len(frames)):
-        source = picture.file or footage.path
-        if normaliser is None:
-            height_px, width_px = picture.rgb.shape[:2]
-            _check_distortion(footage.path, lens, (width_px, height_px))
-            normaliser = Normaliser.create(lens, (width_px, height_px), settings.max_side_px)
         brightest = max(brightest, int(picture.rgb.max()))
-        normaliser.write_image(picture.rgb, source, picture.file, out / "images" / lens.name / f"{picture.frame:06d}")
+        target = out / "images" / lens.name / f"{picture.frame:06d}"
+        normaliser.write_image(picture.rgb, picture.file or footage.path, picture.file, target)
     if brightest <= BLACK:
         raise InputError(f"{footage.path}: all pictures are black; record again, or leave camera {lens.name} out")
-    assert normaliser is not None  # a split has at least one training frame
     if masks:
         _write_masks(normaliser, masks, out / "masks" / lens.name)
     plate = layout.plate_file(lens.name)
     if plate:
         normaliser.write_image(read_image(plate), plate, plate, out / "background" / lens.name)
-    return normaliser
+    return normaliser, area
 
 
 def _write_masks(normaliser: Normaliser, masks: dict[int, Path | StoredFrame], out: Path, soft: bool = False) -> None:
@@ -356,26 +340,29 @@ def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> No
         )
 
 
-def lens_as_recorded(lens: Lens, footage: Footage | InStep, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
-    """Return the lens for the recorded size, and the area that the calibrated picture fills if black bars prove it.
+def lens_as_recorded(
+    lens: Lens, footage: Footage | InStep, frames: tuple[int, ...]
+) -> tuple[Lens, Area | None, tuple[int, int]]:
+    """Return the lens for the recorded size, the area that the calibrated picture fills if black bars prove it, and the
+    (width, height) that is recorded.
 
     Without such a proof the lens is unchanged. Raises InputError if the sizes then differ too much.
     """
     first = next(footage.read(frames[:1]))
     recorded_px = (first.rgb.shape[1], first.rgb.shape[0])
     if lens.size_px in (None, recorded_px):
-        return lens, None
+        return lens, None, recorded_px
     chosen = set(evenly_spaced(frames, BAR_FRAMES))
     area = picture_area([p.rgb for p in footage.read(chosen) if p.rgb.shape == first.rgb.shape])
     matched_lens = lens_for_area(lens, area, recorded_px)
     if matched_lens:
-        return matched_lens, area
+        return matched_lens, area, recorded_px
     if any(abs(r - c) > SIZE_TOLERANCE * c for r, c in zip(recorded_px, lens.size_px, strict=True)):
         raise InputError(
             f"{first.file or footage.path}: is {recorded_px[0]} x {recorded_px[1]} px, but camera {lens.name} was "
             f"calibrated at {lens.size_px[0]} x {lens.size_px[1]}; export the footage at that size or calibrate again"
         )
-    return lens, None
+    return lens, None, recorded_px
 
 
 def _per_frame(
