@@ -56,20 +56,15 @@ def tracked(items: Iterable[T], what: str, count: int) -> Iterator[T]:
 
 def relay() -> None:
     """Write progress as lines on standard output from here on, for the process that started this one."""
-    log.setLevel(logging.DEBUG)
-    log.propagate = False
-    log.addHandler(_Relay())
-
-
-class _Relay(logging.Handler):
     next_s = 0.0
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write a record that `report` made, unless another was written just before and there is more to come."""
-        progress: Progress = vars(record)["progress"]
-        if time.monotonic() >= self.next_s or progress.done >= progress.total:
-            self.next_s = time.monotonic() + RELAY_EVERY_S
+    def write(progress: Progress) -> None:  # unless it was written just before and there is more to come
+        nonlocal next_s
+        if time.monotonic() >= next_s or progress.done >= progress.total:
+            next_s = time.monotonic() + RELAY_EVERY_S
             print(RECORD_SEPARATOR + json.dumps(progress), flush=True)
+
+    _listeners.append(write)
 
 
 def report_relayed(line: str) -> bool:

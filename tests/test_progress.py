@@ -27,13 +27,12 @@ def test_failed_work_is_reported_as_ended(reported: pytest.LogCaptureFixture) ->
 def test_progress_of_another_process_is_relayed(
     reported: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(progress.log, "handlers", [])
-    monkeypatch.setattr(progress.log, "propagate", True)
+    monkeypatch.setattr(progress, "_listeners", [])
     progress.relay()
     for done in (1.5, 2, 4):  # the second within half a second of the first
         progress.report("training", done, 4)
-    progress.log.handlers.clear()
-    progress.log.propagate = True
+    progress._listeners.clear()
+    reported.clear()
     *lines, end = capsys.readouterr().out.split("\n")
     assert [progress.report_relayed(line) for line in (*lines, end, "step 1 of 4")] == [True, True, False, False]
     assert [record.progress for record in reported.records] == [("training", 1.5, 4), ("training", 4, 4)]
