@@ -5,8 +5,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from hnerf.capture.capture import write_image
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
 
 WIDTH, HEIGHT = 24, 16
 CAMERAS = ("01", "02")
@@ -87,3 +91,11 @@ def write_pose2sim(folder: Path) -> Path:
     (folder / "calibration").mkdir()
     (folder / "calibration" / "Calib.toml").write_text("\n".join([*tables, "[metadata]\nerror = 0.0\n"]))
     return folder
+
+
+def refusal(folder: Path, out: Path) -> str:
+    """Return the message with which a recording is refused: one line, and no capture is written."""
+    with pytest.raises(InputError) as refused:
+        ingest(folder, CaptureSettings(), out)
+    assert "\n" not in str(refused.value) and not (out / "capture.json").exists()
+    return str(refused.value)

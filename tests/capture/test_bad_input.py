@@ -11,9 +11,6 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import write_image
-from hnerf.capture.ingest import ingest
-from hnerf.config import CaptureSettings
-from hnerf.errors import InputError
 from tests.capture import recordings as rec
 from tests.capture.test_safe_pickle import Bomb
 
@@ -288,14 +285,6 @@ def _cut_video(path: Path) -> None:
     path.write_bytes(data[: start + length // 2] + bytes(length - length // 2) + data[start + length :])
 
 
-def _refused(folder: Path, tmp_path: Path, names: str) -> None:
-    with pytest.raises(InputError) as refusal:
-        ingest(folder, CaptureSettings(), tmp_path / "out")
-    message = str(refusal.value)
-    assert names in message and "\n" not in message and len(message) < 400
-    assert not (tmp_path / "out" / "capture.json").exists()
-
-
 @pytest.mark.parametrize(
     ("write", "damage", "names"),
     [
@@ -314,11 +303,13 @@ def test_a_damaged_recording_is_refused(
     monkeypatch.chdir(tmp_path)
     folder = write(tmp_path / "walker")
     damage(folder)
-    _refused(folder, tmp_path, names)
+    message = rec.refusal(folder, tmp_path / "out")
+    assert names in message and len(message) < 400
     assert not (tmp_path / "pickle-was-loaded").exists()
 
 
 def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    _refused(tmp_path / "empty", tmp_path, "none of EasyMocap")
-    _refused(tmp_path / "absent", tmp_path, "no such folder")
+    for name, why in (("empty", "none of EasyMocap"), ("absent", "no such folder")):
+        message = rec.refusal(tmp_path / name, tmp_path / "out")
+        assert why in message and len(message) < 400

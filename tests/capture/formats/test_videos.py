@@ -9,8 +9,8 @@ import pytest
 from hnerf.capture.capture import Capture, SubjectPoint, write_image
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
-from hnerf.errors import InputError
 from hnerf.geometry.axes import CAMERA_FROM_Z_UP
+from tests.capture import recordings as rec
 from tests.capture.recordings import HEIGHT, WIDTH, K, write_calibration, write_easymocap, write_keypoints, write_video
 
 SETTINGS = CaptureSettings()
@@ -56,7 +56,7 @@ def test_file_names_given_by_phones_are_accepted(tmp_path: Path, file: str, subj
 
 def test_a_file_name_that_is_too_long_is_refused(clip: Path, tmp_path: Path) -> None:
     long = clip.rename(clip.with_name("a" * 129 + ".mp4"))
-    assert "aaa.mp4: name 'aaaa" in refused(long, tmp_path / "out")
+    assert "aaa.mp4: name 'aaaa" in rec.refusal(long, tmp_path / "out")
 
 
 @pytest.mark.parametrize("place", ["videos/front.MP4", "front.mov", "videos/front.mp4"])
@@ -74,18 +74,11 @@ def test_the_field_of_view_may_be_stated_in_a_folder(
     assert "assumed" not in caplog.text
 
 
-def refused(folder: Path, out: Path) -> str:
-    with pytest.raises(InputError) as refusal:
-        ingest(folder, SETTINGS, out)
-    assert "\n" not in str(refusal.value) and not (out / "capture.json").exists()
-    return str(refusal.value)
-
-
 def test_the_world_of_one_camera_has_z_up(tmp_path: Path) -> None:
     write_video(tmp_path / "ada" / "front.mp4", 3)
     (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')
-    message = "capture.toml: up: z is up where one camera makes the world; remove the line"
-    assert message in refused(tmp_path / "ada", tmp_path / "out")
+    message = rec.refusal(tmp_path / "ada", tmp_path / "out")
+    assert "capture.toml: up: z is up where one camera makes the world; remove the line" in message
 
 
 def test_known_data_of_a_single_video_are_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -108,7 +101,7 @@ def test_known_data_of_a_single_video_are_read(tmp_path: Path, caplog: pytest.Lo
     assert [mask is not None and bool(mask.all()) for mask in masks] == [False, True, False]
     assert plate is not None and (plate == 9).all()
     (folder / "videos" / "01.mp4").rename(folder / "videos" / "front.mp4")
-    assert refused(folder, tmp_path / "again").endswith(
+    assert rec.refusal(folder, tmp_path / "again").endswith(
         "intri.yml: has no camera front; give video and camera one name"
     )
 
@@ -117,7 +110,7 @@ def test_several_videos_need_cameras(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_video(tmp_path / "ada" / f"{name}.mp4", 3)
     (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')  # applies once there are cameras
-    assert "--from person` finds their cameras" in refused(tmp_path / "ada", tmp_path / "out")
+    assert "--from person` finds their cameras" in rec.refusal(tmp_path / "ada", tmp_path / "out")
 
 
 def test_videos_next_to_their_calibration_are_read(tmp_path: Path) -> None:
@@ -132,8 +125,8 @@ def test_videos_next_to_their_calibration_are_read(tmp_path: Path) -> None:
 def test_files_that_are_not_videos_are_refused(tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(b"0" * 1000)
     (tmp_path / "notes.txt").write_text("seen")
-    assert "clip.mp4: not a readable video" in refused(tmp_path / "clip.mp4", tmp_path / "out")
-    assert "notes.txt: is none of" in refused(tmp_path / "notes.txt", tmp_path / "out")
+    assert "clip.mp4: not a readable video" in rec.refusal(tmp_path / "clip.mp4", tmp_path / "out")
+    assert "notes.txt: is none of" in rec.refusal(tmp_path / "notes.txt", tmp_path / "out")
 
 
 def test_the_subject_is_named_in_recorded_pixels(tmp_path: Path) -> None:
