@@ -40,13 +40,12 @@ def gather_pixels(
     capture: Capture,
     masks: Masks,
     body: BodyFit,
-    frames: tuple[int, ...],
     visible_pixels: ReachablePixels | None,
     gains: Gains,
     folder: Path,
     processes: Distributed,
 ) -> Pixels:
-    """Gather the training cameras' pixels in `frames` that can show the fitted body or lie on the mask; none where the
+    """Gather the training cameras' pixels in the fit's frames that can show the body or lie on the mask; none where the
     mask was dropped. visible_pixels None: all pixels, without plates, for a field that models the background.
 
     Colours and plates are divided by the gains of their cameras, if any, as if all were exposed alike. One process
@@ -58,7 +57,7 @@ def gather_pixels(
         if processes.is_main:
             folder.mkdir(parents=True, exist_ok=True)
             _remove(folder)  # what a killed process left
-            _write_pixels(capture, masks, body, frames, visible_pixels, gains, folder)
+            _write_pixels(capture, masks, body, visible_pixels, gains, folder)
         processes.barrier()
         columns: dict[str, Any] = {name: _mapped(folder / f"{name}{SUFFIX}", *kind) for name, kind in COLUMNS.items()}
         processes.barrier()
@@ -78,16 +77,15 @@ def _write_pixels(
     capture: Capture,
     masks: Masks,
     body: BodyFit,
-    frames: tuple[int, ...],
     visible_pixels: ReachablePixels | None,
     gains: Gains,
     folder: Path,
 ) -> None:
     """Write the columns of Pixels, one file each, frame by frame."""
     cameras = [capture.cameras[name] for name in capture.train_cameras]
-    plates = plates_of(capture, masks, frames) if visible_pixels else None
-    vertices_m, columns = body.vertices_m().numpy(), _Columns(folder)
-    for frame in frames:
+    plates = plates_of(capture, masks, body.frames) if visible_pixels else None
+    columns = _Columns(folder)
+    for frame, vertices_m in zip(body.frames, body.vertices_m().numpy(), strict=True):
         edges = [np.zeros(0, bool)]
         for c, camera in enumerate(cameras):
             if (camera.name, frame) not in masks:
@@ -95,7 +93,7 @@ def _write_pixels(
             image, mask = capture.image(camera.name, frame), masks.get(camera.name, frame)
             wanted, edge, gain = np.ones_like(mask), _edge(mask), gains.get(camera.name)
             if visible_pixels:
-                wanted = visible_pixels(camera, vertices_m[body.index(frame)]) | mask
+                wanted = visible_pixels(camera, vertices_m) | mask
                 if plates:
                     wanted &= plates[c].known | ~edge  # at other edges, the person's share is unknown
                 columns.append("pixel_index", np.flatnonzero(wanted))

@@ -81,7 +81,7 @@ class Trainer:
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
         logger.info("gathering pixels")
         visible_pixels = None if self.field.whole_images else self.field.visible_pixels
-        self.pixels = gather_pixels(capture, masks, body, body.frames, visible_pixels, self.gains, out, processes)
+        self.pixels = gather_pixels(capture, masks, body, visible_pixels, self.gains, out, processes)
         self.edge_share = 0.0 if self.field.models_background else EDGE_SHARE  # the paper draws uniformly
         seen = self.pixels.starts.diff() > 0  # False where all masks of a frame were dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}

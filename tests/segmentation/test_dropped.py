@@ -25,9 +25,7 @@ def test_fit_and_training_do_without_dropped_masks(tmp_path: Path) -> None:
     iou = _silhouette_iou(capture, masks, body)
     assert iou == [1.0, None, 1.0]
 
-    pixels, all_pixels = (
-        gather_pixels(capture, m, body, capture.frames, everywhere, {}, tmp_path, ALONE) for m in (masks, whole)
-    )
+    pixels, all_pixels = (gather_pixels(capture, m, body, everywhere, {}, tmp_path, ALONE) for m in (masks, whole))
     count, all_count = pixels.starts.diff().tolist(), all_pixels.starts.diff().tolist()
     assert count[1] == 0 and count[2] == all_count[2]
     first = slice(0, count[0])

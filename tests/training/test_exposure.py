@@ -135,11 +135,9 @@ def test_hidden_and_grazing_vertices_are_not_visible() -> None:
 
 
 def test_pixels_are_corrected_by_the_gains_of_their_cameras(tmp_path: Path) -> None:
-    capture, masks, body = record(tmp_path)
-    gains = {"0": (2.0, 1.0, 0.5)} | dict.fromkeys(capture.train_cameras[1:], (1.0, 1.0, 1.0))
-    pixels, exposure_corrected = (
-        gather_pixels(capture, masks, body, body.frames, everywhere, by, tmp_path, ALONE) for by in ({}, gains)
-    )
+    scene = record(tmp_path)
+    gains = {"0": (2.0, 1.0, 0.5)} | dict.fromkeys(scene[0].train_cameras[1:], (1.0, 1.0, 1.0))
+    pixels, exposure_corrected = (gather_pixels(*scene, everywhere, by, tmp_path, ALONE) for by in ({}, gains))
     first = pixels.cameras_and_xy(torch.arange(len(pixels.person)))[0] == 0
     assert exposure_corrected.colour[first & pixels.person].unique(dim=0).tolist() == [[100, 50, 100]]  # of 200, 50, 50
     assert pixels.plate is not None and exposure_corrected.plate is not None

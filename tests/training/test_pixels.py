@@ -17,7 +17,7 @@ from hnerf.training import gather
 from hnerf.training.gather import gather_pixels
 from hnerf.training.pixels import Pixels
 from hnerf.training.plates import plates_of
-from tests.training.scene import ALONE, SIZE_PX, record
+from tests.training.scene import ALONE, FRAMES, SIZE_PX, record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
 AFAR = dataclasses.replace(AHEAD, K=np.diag([5000.0, 5000.0, 1.0]))  # its rays are almost parallel
@@ -76,7 +76,7 @@ def test_gathered_pixels_equal_those_of_the_images(tmp_path: Path, visible_pixel
     out = tmp_path / "out"
     out.mkdir()
     (out / "plate.pixels").write_bytes(b"of a process that was killed")
-    pixels = gather_pixels(capture, masks, body, body.frames, visible_pixels, {}, out, ALONE)
+    pixels = gather_pixels(capture, masks, body, visible_pixels, {}, out, ALONE)
     assert not any(out.iterdir())
     assert (pixels.pixel_index is None) == (pixels.plate is None) == (visible_pixels is None)
     camera, xy_px = pixels.cameras_and_xy(torch.arange(len(pixels.person)))
@@ -94,9 +94,8 @@ def test_gathered_pixels_equal_those_of_the_images(tmp_path: Path, visible_pixel
 def test_gathering_that_fills_the_disk_leaves_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr(gather, "_exposure_corrected", Mock(side_effect=full))
-    capture, masks, body = record(tmp_path)
     with pytest.raises(OSError, match="No space left"):
-        gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path / "out", ALONE)
+        gather_pixels(*record(tmp_path), REACHED, {}, tmp_path / "out", ALONE)
     assert not any((tmp_path / "out").iterdir())
 
 
@@ -108,7 +107,7 @@ def test_an_image_that_the_body_does_not_reach_has_no_pixels(tmp_path: Path) -> 
         left = camera.name == "1" and np.array_equal(vertices_m, body.vertices_m()[0])
         return REACHED(camera, vertices_m) & (not left)
 
-    pixels = gather_pixels(capture, masks, body, body.frames, reached, {}, tmp_path, ALONE)
+    pixels = gather_pixels(capture, masks, body, reached, {}, tmp_path, ALONE)
     assert pixels.plate is not None and pixels.plate.shape == pixels.colour.shape
     assert int(pixels.image_starts.diff()[1]) == 0 < int(pixels.image_starts.diff()[2])
 
@@ -119,11 +118,11 @@ def test_outline_pixels_with_an_unknown_background_are_left_out(
     """The background of one camera is unknown: only its outline pixels are left out, not its other pixels nor those of
     other cameras."""
     capture, masks, body = record(tmp_path)
-    every = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
+    every = gather_pixels(capture, masks, body, REACHED, {}, tmp_path, ALONE)
     plates = plates_of(capture, masks, body.frames) or []
     plates[1].known[:] = False
     monkeypatch.setattr(gather, "plates_of", lambda *_: plates)
-    some = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
+    some = gather_pixels(capture, masks, body, REACHED, {}, tmp_path, ALONE)
     left_out = every.edge & (every.cameras_and_xy(torch.arange(len(every.edge)))[0] == 1)
     assert left_out.any() and torch.equal(some.colour, every.colour[~left_out])
     assert torch.equal(some.edges, torch.nonzero(some.edge)[:, 0])
@@ -135,16 +134,15 @@ def test_edges_extend_two_pixels_inwards_and_outwards(tmp_path: Path):
     square = np.zeros((SIZE_PX, SIZE_PX), bool)
     square[10:22, 10:22] = True
     masks.encoded["0", 0] = encode(square)
-    pixels = gather_pixels(capture, masks, body, (0,), None, {}, tmp_path, ALONE)
+    pixels = gather_pixels(capture, masks, body, None, {}, tmp_path, ALONE)
     edge = pixels.edge[: SIZE_PX**2].view(SIZE_PX, SIZE_PX)
     assert edge.sum() == 16**2 - 8**2 and edge[8:24, 8:24].sum() == edge.sum() and not edge[12:20, 12:20].any()
 
 
 def test_edges_are_found_in_every_frame(tmp_path: Path):
-    capture, masks, body = record(tmp_path)
-    pixels = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
+    pixels = gather_pixels(*record(tmp_path), REACHED, {}, tmp_path, ALONE)
     assert torch.equal(pixels.edges, torch.nonzero(pixels.edge)[:, 0])
-    for row in range(len(body.frames)):
+    for row in range(len(FRAMES)):
         part = pixels.edges[pixels.edge_starts[row] : pixels.edge_starts[row + 1]]
         assert len(part)
         assert ((part >= pixels.starts[row]) & (part < pixels.starts[row + 1])).all()
@@ -155,7 +153,7 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
     capture, masks, body = record(tmp_path)
     for camera in capture.train_cameras:
         masks.encoded[camera, 0] = encode(np.ones((SIZE_PX, SIZE_PX), bool))
-    pixels = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
+    pixels = gather_pixels(capture, masks, body, REACHED, {}, tmp_path, ALONE)
     assert torch.equal(pixels.edges[: pixels.edge_starts[1]], torch.arange(int(pixels.starts[1])))
 
 
