@@ -67,14 +67,14 @@ class Slope(nn.Module):
         return 0.1 * point[:, 0]
 
 
-def field_of(static: bool = False, **changes: object) -> PaperField:
-    field = PaperField(RIG, ROOT, SETTINGS.model_copy(update=changes), static)
+def field_of(static: bool = False, root: Tensor = ROOT, **changes: object) -> PaperField:
+    field = PaperField(RIG, root, SETTINGS.model_copy(update=changes), static)
     field.radiance, field.residual = Fog(), Slope()
     return field
 
 
-def bodies() -> tuple[PosedBodies, Conditions]:
-    return PosedBodies(RIG, THETA, ROOT, RIG.vertices_m), Conditions.of(RIG, THETA, ROOT, torch.arange(2), 2.0)
+def bodies(theta: Tensor = THETA, root: Tensor = ROOT) -> tuple[PosedBodies, Conditions]:
+    return PosedBodies(RIG, theta, root, RIG.vertices_m), Conditions.of(RIG, theta, root, torch.arange(2), 2.0)
 
 
 def sampled(field: PaperField, draws: Draws = DRAWS) -> tuple[RaySamples, Tensor]:
@@ -125,12 +125,9 @@ def test_a_person_outside_the_scene_is_sampled(walk_m: float) -> None:
     -.5, .5 and 1.5 m, of which the third is in B, from -.1 to 1.1 m."""
     root = torch.eye(4).repeat(2, 1, 1)
     root[1, 1, 3] = walk_m
-    field = PaperField(RIG, root, SETTINGS, static=False)
-    field.radiance, field.residual = Fog(), Slope()
-    standing = PosedBodies(RIG, 0 * THETA, root, RIG.vertices_m)
-    conditions = Conditions.of(RIG, 0 * THETA, root, torch.arange(2), 2.0)
+    field = field_of(root=root)
     ray = replace(RAY, origins_m=torch.tensor([[-3.0, walk_m + 0.5, 0.5]]))
-    samples, depths = field.sample(field.scene(standing, conditions), ray, DRAWS)
+    samples, depths = field.sample(field.scene(*bodies(0 * THETA, root)), ray, DRAWS)
     assert depths.min() >= 1 and depths.max() <= 5
     within = (depths > 2.9) & (depths < 4.1)
     assert within.sum() > 0 and torch.equal(samples.in_box, within.float())
@@ -142,13 +139,10 @@ def test_no_background_is_seen_where_a_ray_leaves_scene_and_box_at_once() -> Non
     what is opaque is its last sample, which is the background."""
     root = torch.eye(4).repeat(2, 1, 1)
     root[1, 1, 3] = 6.0
-    field = PaperField(RIG, root, SETTINGS.model_copy(update={"samples": 64}), static=False)
-    field.radiance, field.residual = Fog(), Slope()
+    field = field_of(root=root, samples=64)
     field.radiance.density.data.fill_(1e-3)
-    standing = PosedBodies(RIG, 0 * THETA, root, RIG.vertices_m)
-    conditions = Conditions.of(RIG, 0 * THETA, root, torch.arange(2), 2.0)
     ray = Rays(torch.tensor([[1.05, -3.0, 0.5]]), torch.tensor([[0.0, 1, 0]]), torch.tensor([1]))
-    rendered = field.render_rays(field.scene(standing, conditions), ray)
+    rendered = field.render_rays(field.scene(*bodies(0 * THETA, root)), ray)
     assert 1e-4 < rendered[0, 3] < 1e-3
 
 

@@ -27,6 +27,8 @@ SAMPLES = RaySamples(
     elastic=torch.tensor([0.2]),
 )
 TARGET = Target(colour=torch.tensor([RED, BLACK]), person=torch.tensor([1.0, 0.0]), weight=torch.ones(2))
+DOUBLE = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
+DOUBLE_TARGET = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
 
 
 def test_reconstruction():
@@ -162,44 +164,32 @@ def test_elastic():
 @pytest.mark.parametrize("name", ["reconstruction", "mask", "fog", "eikonal", "residual"])
 def test_gradients_in_double_precision(name: str):
     def loss(alpha, residual, norms):
-        samples = replace(double, alpha=alpha, residual=residual, gradient_norm=norms)
-        return (
-            getattr(losses, name)(samples, target)
-            if name in ("reconstruction", "mask", "fog")
-            else getattr(losses, name)(samples)
-        )
+        samples = replace(DOUBLE, alpha=alpha, residual=residual, gradient_norm=norms)
+        compared = [DOUBLE_TARGET] if name in ("reconstruction", "mask", "fog") else []
+        return getattr(losses, name)(samples, *compared)
 
-    double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
-    target = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
-    inputs = [x.clone().requires_grad_() for x in (double.alpha + 0.05, double.residual, double.gradient_norm)]
+    inputs = [x.clone().requires_grad_() for x in (DOUBLE.alpha + 0.05, DOUBLE.residual, DOUBLE.gradient_norm)]
     assert torch.autograd.gradcheck(loss, inputs)
 
 
 def test_gradients_of_coupled_losses_in_double_precision():
-    double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
-    target = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
-
     def coupled(alpha_dot, density, residual):
-        samples = replace(double, alpha_dot=alpha_dot, density=density, residual=residual)
+        samples = replace(DOUBLE, alpha_dot=alpha_dot, density=density, residual=residual)
         return (
-            losses.blend(samples, target, 0.25)
+            losses.blend(samples, DOUBLE_TARGET, 0.25)
             + losses.geometry(samples, 50.0, 0.1, "print")
-            + losses.segmentation(samples.d_hat, target, 80.0)
+            + losses.segmentation(samples.d_hat, DOUBLE_TARGET, 80.0)
         )
 
-    alpha_dot = (0.05 + 0.9 * double.alpha_dot).requires_grad_()
-    assert torch.autograd.gradcheck(
-        coupled, (alpha_dot, double.density.requires_grad_(), double.residual.requires_grad_())
-    )
+    inputs = [x.clone().requires_grad_() for x in (0.05 + 0.9 * DOUBLE.alpha_dot, DOUBLE.density, DOUBLE.residual)]
+    assert torch.autograd.gradcheck(coupled, inputs)
 
 
 def test_the_gradient_of_geometry_with_the_surface_as_labels_in_double_precision():
-    double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
-
     def follow(density):
-        return losses.geometry(replace(double, density=density), 50.0, 0.1, "surface_leads")
+        return losses.geometry(replace(DOUBLE, density=density), 50.0, 0.1, "surface_leads")
 
-    assert torch.autograd.gradcheck(follow, double.density.requires_grad_())
+    assert torch.autograd.gradcheck(follow, DOUBLE.density.clone().requires_grad_())
 
 
 def test_gradients_of_pose_and_deformation_losses_in_double_precision():
@@ -213,9 +203,8 @@ def test_gradients_of_pose_and_deformation_losses_in_double_precision():
         return torch.func.functional_call(Increment(correction), {f"correction.{k}": v for k, v in named.items()}, ())
 
     assert torch.autograd.gradcheck(pulled, values)
-    double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
     energy = torch.rand(3, generator=generator, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda e: losses.elastic(replace(double, elastic=e)), energy)
+    assert torch.autograd.gradcheck(lambda e: losses.elastic(replace(DOUBLE, elastic=e)), energy)
 
 
 class Increment(torch.nn.Module):
