@@ -15,15 +15,8 @@ from uuid import uuid4
 ROOT = Path(__file__).parents[1]
 MARK = "HNERF_SOAK"  # an environment variable of every process that is started here
 # Run a command in a mount namespace of its own, in which the first folder is mounted on the second.
-WITH_DISK = (
-    "unshare",
-    "--map-root-user",
-    "--mount",
-    "sh",
-    "-c",
-    'mount --bind "$1" "$2" && shift 2 && exec "$@"',
-    "sh",
-)
+MOUNTED = 'mount --bind "$1" "$2" && shift 2 && exec "$@"'
+WITH_DISK = ("unshare", "--map-root-user", "--mount", "sh", "-c", MOUNTED, "sh")
 WORKER = ("prefect", "worker", "start", "--pool", "local", "--type", "process", "--limit", "2")
 FLOW_RUN = ("prefect.flow_engine", "prefect.engine")
 DELAY_S = 20.0  # the longest wait before a run is killed

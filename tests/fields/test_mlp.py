@@ -7,16 +7,8 @@ def test_networks_have_the_papers_sizes():
     """F has eight layers of 256, and its fifth layer takes the input again; DH has six layers of 128."""
     radiance = RadianceMLP(4, 57, 12)
     inputs = 4 * 17 + 57
-    assert [layer.in_features for layer in radiance.trunk.layers] == [
-        inputs,
-        256,
-        256,
-        256,
-        256 + inputs,
-        256,
-        256,
-        256,
-    ]
+    widths = [inputs, 256, 256, 256, 256 + inputs, 256, 256, 256]
+    assert [layer.in_features for layer in radiance.trunk.layers] == widths
     residual = ResidualMLP(4, 57)
     assert [layer.out_features for layer in residual.trunk.layers] == [128] * 6
     inputs = 4 * 3 + 57  # encoded with one octave
