@@ -101,16 +101,15 @@ def test_the_error_of_a_missing_server_is_one_line(capsys: pytest.CaptureFixture
     assert line.startswith("http://127.0.0.1:9/api: ") and "is the server running" in line
 
 
-def test_a_silence_shorter_than_that_of_healthy_runs_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("option", "told"), [("--silence=30", "give 60 or more"), ("--webhook=", "--webhook is empty")]
+)
+def test_a_silence_of_healthy_runs_and_an_empty_webhook_are_refused(
+    option: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit, match="2"):
-        main(["--silence", "30"])
-    assert "give 60 or more" in capsys.readouterr().err
-
-
-def test_an_empty_webhook_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main(["--webhook", ""])
-    assert "--webhook is empty" in capsys.readouterr().err
+        main([option])
+    assert told in capsys.readouterr().err
 
 
 def test_no_automations_are_set_up_in_a_temporary_server(capsys: pytest.CaptureFixture[str]) -> None:
