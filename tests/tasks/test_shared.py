@@ -183,10 +183,6 @@ def finish(out: Path) -> dict[str, float]:
     return write(out)
 
 
-def shared_checkpoint_bytes(bucket: Bucket) -> bytes | None:
-    return bucket.read_note(CHECKPOINT)
-
-
 def wait_until(reached: Callable[[], bool]) -> None:
     deadline_s = time.monotonic() + 20
     while not reached():
@@ -207,9 +203,9 @@ def test_another_machine_resumes_failed_work_from_its_checkpoint(bucket: Bucket,
     here, there = Store(tmp_path / "here"), Store(tmp_path / "there")
     with pytest.raises(RuntimeError):
         resumed(bucket, here, fail)
-    assert shared_checkpoint_bytes(bucket) == b"step 100"
+    assert bucket.read_note(CHECKPOINT) == b"step 100"
     assert resumed(bucket, there, go_on).files.keys() == {"again", "deep/letters"}
-    assert shared_checkpoint_bytes(bucket) is None and clean(there)
+    assert bucket.read_note(CHECKPOINT) is None and clean(there)
     resumed(bucket, here, never)
     for store in (here, there):
         assert {path.name for path in (store.root / "training").iterdir()} == {KEY, f"{KEY}.json", f"{KEY}.lock"}
@@ -234,14 +230,14 @@ def test_work_resumes_from_the_checkpoint_of_the_machine_that_worked_last(bucket
     attempt(here)
     own.write_text("step 900")
     attempt(here)
-    assert begun == ["", "step 900"] and shared_checkpoint_bytes(bucket) == b"step 900"
+    assert begun == ["", "step 900"] and bucket.read_note(CHECKPOINT) == b"step 900"
     attempt(there)
     bucket.upload(write_file(tmp_path / "elsewhere", "step 2000"), CHECKPOINT)
     attempt(here)
     assert begun[2:] == ["step 900", "step 2000"] and own.read_text() == "step 2000"
     bucket.remove(CHECKPOINT)
     attempt(here)
-    assert shared_checkpoint_bytes(bucket) == b"step 2000"
+    assert bucket.read_note(CHECKPOINT) == b"step 2000"
 
 
 def test_a_checkpoint_may_be_removed_while_it_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,14 +260,14 @@ def test_each_new_checkpoint_is_uploaded_once_during_the_work(
         for text in ("step 100", "step 200"):
             (out / "beside").write_text(text)
             os.replace(out / "beside", out / "checkpoint")
-            wait_until(lambda text=text: shared_checkpoint_bytes(bucket) == text.encode())  # type: ignore[misc]
+            wait_until(lambda text=text: bucket.read_note(CHECKPOINT) == text.encode())  # type: ignore[misc]
             time.sleep(0.05)
         return finish(out)
 
     monkeypatch.setattr(shared_checkpoint, "LOOK_S", 0.01)
     monkeypatch.setattr(Bucket, "upload", counted)
     resumed(bucket, Store(tmp_path / "here"), work)
-    assert shared_checkpoint_bytes(bucket) is None and uploads == [CHECKPOINT, CHECKPOINT, f"training/{KEY}.tar"]
+    assert bucket.read_note(CHECKPOINT) is None and uploads == [CHECKPOINT, CHECKPOINT, f"training/{KEY}.tar"]
 
 
 def test_a_checkpoint_replaced_during_its_upload_arrives_intact(
@@ -287,7 +283,7 @@ def test_a_checkpoint_replaced_during_its_upload_arrives_intact(
 
     monkeypatch.setattr(Bucket, "upload", replaced)
     shared_checkpoint._put(bucket, CHECKPOINT, checkpoint, tmp_path / "known")
-    assert shared_checkpoint_bytes(bucket) == b"old and long" and checkpoint.read_text() == "new"
+    assert bucket.read_note(CHECKPOINT) == b"old and long" and checkpoint.read_text() == "new"
 
 
 def test_refused_work_leaves_no_checkpoint(tmp_path: Path) -> None:
@@ -296,7 +292,7 @@ def test_refused_work_leaves_no_checkpoint(tmp_path: Path) -> None:
 
     with pytest.raises(InputError, match="nobody"):
         resumed(bucket, store, Mock(side_effect=InputError("nobody is in the pictures")))
-    assert shared_checkpoint_bytes(bucket) is None and not store.path("training", KEY, ".partial").exists()
+    assert bucket.read_note(CHECKPOINT) is None and not store.path("training", KEY, ".partial").exists()
 
 
 def test_work_continues_if_the_checkpoint_cannot_be_uploaded(

@@ -72,7 +72,8 @@ def test_the_image_count_is_that_of_the_largest_recording(tmp_path: Path) -> Non
         described = {"cameras": ["a", "b"], "train_frames": list(range(frames - 1)), "novel_pose_frames": [frames - 1]}
         (tmp_path / str(frames) / "capture.json").write_text(json.dumps(described))
         recordings.append(Artifact(stage="capture", root=tmp_path / str(frames), files={}))
-    assert image_count([*recordings, None]) == 10 and image_count([CaptureSettings()]) == 1
+    assert image_count([*recordings, None]) == image_count([None, tuple(recordings)]) == 10
+    assert image_count([CaptureSettings()]) == image_count([None]) == 1
 
 
 def test_machines_that_share_a_bucket_run_each_stage_once(

@@ -372,14 +372,6 @@ def test_two_processes_with_one_id_can_link_at_once(tmp_path: Path, monkeypatch:
     assert os.readlink(tmp_path / "subjects" / "ada" / "fit") == "../../fit/mine"
 
 
-def test_new_hands_replace_the_old_ones_and_later_results(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    for stage in ("hands", "fit"):
-        store.link_latest("ada", store.get_or_compute(stage, "old", write_abc))
-    store.link_latest("ada", store.get_or_compute("hands", "new", write_abc))
-    assert [path.name for path in (tmp_path / "subjects" / "ada").iterdir()] == ["hands"]
-
-
 def test_new_hands_unlink_results_computed_without_them(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("capture", "fit", "asset", "hands"):
