@@ -35,12 +35,7 @@ from tests.evaluation.ball import (
 )
 
 GAP_M = 0.01  # between the ball and its true surface
-GREYS = {
-    "training": 102,
-    "5": 51,
-    "10": 76.5,
-    "12": 0,
-}  # of 255: the finished model, and the snapshots by their seconds
+GREYS = {"training": 102, "5": 51, "10": 76.5, "12": 0}  # of 255: the finished model, and snapshots by their seconds
 SETTINGS = ScoringSettings(meshes=1, snapshot_images=2, snapshot_meshes=0, frame_sizes_px=(16, 32))
 
 
