@@ -56,26 +56,6 @@ class Prior:
         """Return whether the person is known to be outside the image."""
         return (self.height_px > 0 or self.behind) and not self.reach.any()
 
-    @staticmethod
-    def around(
-        core: np.ndarray,
-        body: np.ndarray,
-        completed: np.ndarray,
-        height_px: float,
-        reach: float,
-        upright: bool = False,
-        behind: bool = False,
-    ) -> "Prior":
-        """Return the prior grown around the body, seen and completed, (H, W) bool; reach in heights of the person.
-
-        In an upright image, anything far below the lowest part of the body is its reflection and is excluded.
-        """
-        away_px = cv2.distanceTransform(np.where(completed, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-        within = away_px <= reach * height_px
-        if upright and completed.any():
-            within[int(np.flatnonzero(completed.any(1))[-1] + SOLE_SHARE * height_px) + 1 :] = False
-        return Prior(core, body, within & (away_px <= NEAR_SHARE * height_px), within, height_px, behind)
-
     def cropped(self, window: tuple[slice, slice]) -> "Prior":
         """Return the same prior within a window of the image."""
         core, body, near, reach = (part[window] for part in (self.core, self.body, self.near, self.reach))
@@ -108,8 +88,7 @@ def keypoint_priors(capture: Capture, camera: str, keypoints: np.ndarray, settin
 
 def _keypoint_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:
     stick = _stick_figure(capture.cameras[camera], poses_px[number])
-    upright = _is_upright(capture, camera)
-    return Prior.around(stick.core, stick.body, stick.completed, stick.height_px, reach, upright, stick.behind)
+    return _grown(capture, camera, stick, stick.core, stick.body, stick.completed, reach)
 
 
 def _body_prior(
@@ -118,10 +97,8 @@ def _body_prior(
 ) -> Prior:  # fmt: skip
     stick = _stick_figure(capture.cameras[camera], poses_px[number])
     covered = silhouette(capture.cameras[camera], vertices_m[number], faces)
-    core = _core(covered, stick.height_px)
-    covered |= stick.body
-    upright = _is_upright(capture, camera)
-    return Prior.around(core, covered, covered, stick.height_px, reach / 2, upright, stick.behind)
+    body = covered | stick.body
+    return _grown(capture, camera, stick, _core(covered, stick.height_px), body, body, reach / 2)
 
 
 def _network_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:
@@ -134,7 +111,25 @@ def _network_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: f
         return figure
     core = _core(likely > SURE, figure.height_px)
     body = covered | figure.core
-    return Prior.around(core & covered, body, body, figure.height_px, reach / 2, _is_upright(capture, camera))
+    return _grown(capture, camera, figure, core & covered, body, body, reach / 2)
+
+
+def _grown(
+    capture: Capture, camera: str, figure: "Prior | _StickFigure", core: np.ndarray, body: np.ndarray,
+    completed: np.ndarray, reach: float,
+) -> Prior:  # fmt: skip
+    """Return the prior grown around the body, seen and completed, (H, W) bool; reach in heights of the person.
+
+    In an image whose rows run downwards in the world, anything far below the lowest part of the body is its reflection
+    and is excluded.
+    """
+    away_px = cv2.distanceTransform((~completed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    within = away_px <= reach * figure.height_px
+    upright = -capture.cameras[camera].R[1, "xyz".index(capture.up)] > UPRIGHT
+    if upright and completed.any():
+        within[int(np.flatnonzero(completed.any(1))[-1] + SOLE_SHARE * figure.height_px) + 1 :] = False
+    near = within & (away_px <= NEAR_SHARE * figure.height_px)
+    return Prior(core, body, near, within, figure.height_px, figure.behind)
 
 
 def _core(covered: np.ndarray, height_px: float) -> np.ndarray:
@@ -142,11 +137,6 @@ def _core(covered: np.ndarray, height_px: float) -> np.ndarray:
     size."""
     depth_px = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     return np.asarray(depth_px > max(1, round(CORE_SHARE * height_px)))
-
-
-def _is_upright(capture: Capture, camera: str) -> bool:
-    """Return whether the image's rows run downwards in the world."""
-    return bool(-capture.cameras[camera].R[1, "xyz".index(capture.up)] > UPRIGHT)
 
 
 def bounding_window(region: np.ndarray) -> tuple[slice, slice]:
