@@ -11,13 +11,12 @@ from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import Observations
 from hnerf.body.robust import geman_mcclure
 from hnerf.capture.capture import Capture
+from hnerf.capture.keypoint_sets import SETS
 from hnerf.detection.merge import nearest_person
 
 # Error of the depth between two landmarks, against the truth: 45 to 130 mm, bias included, on two rendered recordings.
 DEPTH_STD_M, OUTLIER_M = 0.1, 0.3
 
-# BODY_25 keypoints and the BlazePose landmarks that correspond to them: shoulders, elbows, wrists, hips, knees, ankles.
-LANDMARKS = {2: 12, 3: 14, 4: 16, 5: 11, 6: 13, 7: 15, 9: 24, 10: 26, 11: 28, 12: 23, 13: 25, 14: 27}
 # Limbs from the trunk, hips, shoulders. The trunk is left out: the network sees it lean back by a decimetre.
 LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (9, 10), (10, 11), (12, 13), (13, 14), (9, 12), (2, 5))
 
@@ -55,7 +54,8 @@ def observe_limb_depths(capture: Capture, observations: Observations) -> LimbDep
     found = capture.landmarks(capture.train_cameras[0])
     if found is None or len(capture.train_cameras) > 1:
         return None
-    own, places = list(LANDMARKS), list(LANDMARKS.values())
+    own = sorted({end for limb in LIMBS for end in limb})
+    places = [SETS["blazepose_33"].rows[keypoint][0] for keypoint in own]
     pixels, metres = (points[:, :, places] for points in found)
     keypoints = observations.keypoints(0)[:, own]
     depths_m, trust = np.zeros((2, len(keypoints), len(LIMBS)))
@@ -66,9 +66,7 @@ def observe_limb_depths(capture: Capture, observations: Observations) -> LimbDep
             depth_m, seen = metres[t, person, :, 2], pixels[t, person, :, 2]
             depths_m[t] = depth_m[ends[:, 1]] - depth_m[ends[:, 0]]
             trust[t] = np.minimum(seen[ends[:, 0]], seen[ends[:, 1]])
-    camera = observations.cameras[0]
     shown = np.where(keypoints[..., 2:] > 0, 1.0, 0.0)
     middle = (keypoints[..., :2] * shown).sum(1) / shown.sum(1).clip(1)
-    rays = np.column_stack([middle, np.ones(len(middle))]) @ np.linalg.inv(camera.K).T @ camera.R
-    away = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    _, away = observations.cameras[0].rays(middle)
     return LimbDepths(*(torch.from_numpy(part) for part in (depths_m, trust, away)))
