@@ -50,20 +50,19 @@ class FingerPrior:
     def of(rig: Rig) -> "FingerPrior":
         """Return the priors for a rig. Angles count from straight fingers, so the bend at rest is subtracted."""
         axes, bends = [], []
-        for side in SIDES:
-            at = {name: rig.joints_m[rig.joint_names.index(f"{name}.{side}")] for name in ["wrist", *_names()]}
-            normal = torch.linalg.cross(at["finger2-1"] - at["wrist"], at["finger5-1"] - at["wrist"])
+        hands_m = rig.joints_m[[rig.joint_names.index(name) for name in finger_joints()]].view(2, 5, 3, 3)
+        for side, fingers_m in zip(SIDES, hands_m, strict=True):
+            wrist_m = rig.joints_m[rig.joint_names.index(f"wrist.{side}")]
+            normal = torch.linalg.cross(fingers_m[1, 0] - wrist_m, fingers_m[4, 0] - wrist_m)
             palmwards = normal if side == "R" else -normal  # the direction in which fingers bend
-            for finger in range(1, 6):
-                chain = [at[f"finger{finger}-{segment}"] for segment in (1, 2, 3)]
-                bones = [chain[0] - at["wrist"], chain[1] - chain[0], chain[2] - chain[1]]
-                bones = [bone / bone.norm() for bone in [*bones, bones[-1]]]
-                for above, bone in itertools.pairwise(bones):
-                    axis = normal if finger == 1 else torch.linalg.cross(bone, palmwards)
+            for finger, chain_m in enumerate(fingers_m):
+                bones = [bone / bone.norm() for bone in chain_m.diff(dim=0, prepend=wrist_m[None])]
+                for above, bone in itertools.pairwise([*bones, bones[-1]]):
+                    axis = normal if finger == 0 else torch.linalg.cross(bone, palmwards)
                     axis = axis - (axis @ bone) * bone
                     axis = axis / axis.norm()
                     axes.append(torch.stack([axis, bone, torch.linalg.cross(axis, bone)]))
-                    bends.append(torch.linalg.cross(above, bone) @ axis if finger > 1 else bone.new_zeros(()))
+                    bends.append(torch.linalg.cross(above, bone) @ axis if finger > 0 else bone.new_zeros(()))
         relaxed = torch.tensor([*THUMB_RELAXED_DEG, *4 * RELAXED_DEG] * 2, dtype=rig.joints_m.dtype)
         std = torch.tensor([*THUMB_STD_DEG, *4 * STD_DEG] * 2, dtype=relaxed.dtype)
         bend = torch.stack(bends).asin()
@@ -154,7 +153,3 @@ def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int,
         step, _ = equations.step(DAMPING, np.zeros(0), np.zeros(0))
         theta[:, fingers] += torch.from_numpy(step).unflatten(-1, (-1, 3))
     return replace(pose, theta=theta)
-
-
-def _names() -> list[str]:
-    return sorted({name.split(".")[0] for name in finger_joints()})
