@@ -128,36 +128,26 @@ class PosedBodies:
         return PoseCorrection(len(self.theta), len(self._free), len(self.rig.beta)).to(self.rig.vertices_m.device)
 
     def describe(
-        self,
-        points_m: Tensor,
-        frame: Tensor,
-        reach_m: float,
-        correction: PoseCorrection | None = None,
+        self, points_m: Tensor, frame: Tensor, reach_m: float, correction: PoseCorrection | None = None,
         exact_sign: bool = False,
-        s_follows: bool = True,
-        beside_m: Tensor | None = None,
-    ) -> Descriptor:
+    ) -> Descriptor:  # fmt: skip
         """Return descriptors of world points (N, 3) relative to the bodies of rows `frame` (N,); gradients flow to the
-        points and the correction; through s, only if `s_follows`.
-
-        beside_m (M, N, 3): return instead the descriptors of the points moved by M offsets each, (M N,), to first
-        order, with one search for the closest points.
-        """
+        points and the correction."""
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
-        return self._described(points_m, frame, found, correction, s_follows, beside_m)
+        return self._described(points_m, frame, found, correction)
 
     def describe_by_limbs(
-        self,
-        points_m: Tensor,
-        frame: Tensor,
-        reach_m: float,
-        correction: PoseCorrection | None = None,
-        exact_sign: bool = False,
-        beside_m: Tensor | None = None,
-    ) -> tuple[Descriptor, Tensor]:
+        self, points_m: Tensor, frame: Tensor, reach_m: float, correction: PoseCorrection | None = None,
+        exact_sign: bool = False, beside_m: Tensor | None = None,
+    ) -> tuple[Descriptor, Tensor]:  # fmt: skip
         """Return what `describe` returns, followed by M descriptors relative to limbs other than the closest one, where
-        the pose brings them close to it; and the points that these M belong to, (M,). No s follows the points."""
-        closest = self.describe(points_m, frame, reach_m, correction, exact_sign, False, beside_m)
+        the pose brings them close to it; and the points that these M belong to, (M,). No s follows the points.
+
+        beside_m (K, N, 3): describe instead the points moved by K offsets each, (K N,), to first order, with one search
+        for the closest points.
+        """
+        found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
+        closest = self._described(points_m, frame, found, correction, False, beside_m)
         if not self._limb_meshes:
             return closest, torch.zeros(0, dtype=torch.long, device=frame.device)
         close = self._close[frame.long(), closest.vertex[: len(frame)]] & closest.near[: len(frame), None]
@@ -185,15 +175,11 @@ class PosedBodies:
         return more, ClosestPoints(*closest)
 
     def _described(
-        self,
-        points_m: Tensor,
-        frame: Tensor,
-        found: ClosestPoints,
-        correction: PoseCorrection | None,
-        s_follows: bool,
-        beside_m: Tensor | None,
-    ) -> Descriptor:
-        """Return the descriptors of points from their closest points; the arguments are those of `describe`."""
+        self, points_m: Tensor, frame: Tensor, found: ClosestPoints, correction: PoseCorrection | None,
+        s_follows: bool = True, beside_m: Tensor | None = None,
+    ) -> Descriptor:  # fmt: skip
+        """Return the descriptors of points from their closest points; the arguments are those of `describe_by_limbs`.
+        Gradients flow through s only if `s_follows`."""
         moved = points_m - points_m.detach()  # zero, but carries the gradient
         if beside_m is not None:
             many = len(beside_m)

@@ -275,7 +275,7 @@ def test_first_order_descriptors_of_offset_points_match_exact_ones() -> None:
     bodies = PosedBodies(rig, torch.zeros(1, 2, 3), root, rig.vertices_m)
     points_m, frame = torch.tensor([[-0.4, 0.6, 1.02], [-0.45, 0.5, 0.98]]), torch.zeros(2, dtype=torch.long)
     beside_m = torch.tensor([[[0.01, 0.0, 0.005]] * 2, [[0.0, -0.01, 0.0]] * 2])
-    found = bodies.describe(points_m, frame, 0.1, beside_m=beside_m)
+    found, _ = bodies.describe_by_limbs(points_m, frame, 0.1, beside_m=beside_m)
     asked = bodies.describe((points_m + beside_m).flatten(0, 1), frame.repeat(2), 0.1)
     for name in ("d", "y"):
         torch.testing.assert_close(getattr(found, name), getattr(asked, name), atol=1e-5, rtol=0)
