@@ -17,29 +17,12 @@ PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 
 # anny's local changes of limbs, trunk and head, for what phenotypes cannot express; left and right change together.
 LOCAL_CHANGES = (
-    "measure-upperarm-length",
-    "measure-lowerarm-length",
-    "measure-upperleg-height",
-    "measure-lowerleg-height",
-    "measure-napetowaist-dist",
-    "measure-shoulder-dist",
-    "measure-neck-height",
-    "measure-upperarm-circ",
-    "l-lowerarm-fat+r-lowerarm-fat",
-    "measure-thigh-circ",
-    "measure-calf-circ",
-    "measure-waist-circ",
-    "measure-hips-circ",
-    "torso-scale-horiz",
-    "torso-scale-depth",
-    "hip-scale-horiz",
-    "hip-scale-depth",
-    "head-scale-vert",
-    "head-scale-depth",
-    "head-scale-horiz",
-    "l-foot-scale+r-foot-scale",
-    "l-hand-scale+r-hand-scale",
-)
+    "measure-upperarm-length", "measure-lowerarm-length", "measure-upperleg-height", "measure-lowerleg-height",
+    "measure-napetowaist-dist", "measure-shoulder-dist", "measure-neck-height", "measure-upperarm-circ",
+    "l-lowerarm-fat+r-lowerarm-fat", "measure-thigh-circ", "measure-calf-circ", "measure-waist-circ",
+    "measure-hips-circ", "torso-scale-horiz", "torso-scale-depth", "hip-scale-horiz", "hip-scale-depth",
+    "head-scale-vert", "head-scale-depth", "head-scale-horiz", "l-foot-scale+r-foot-scale", "l-hand-scale+r-hand-scale",
+)  # fmt: skip
 BETA_NAMES = PHENOTYPES + LOCAL_CHANGES
 ADULT = (0.5, 0.72, 0.5, 0.5, 0.5, 0.5) + (0.0,) * len(LOCAL_CHANGES)  # at age 0.5 anny is a teenager of 1.63 m
 BETA_LOW = (0.0,) * len(PHENOTYPES) + (-1.0,) * len(LOCAL_CHANGES)
