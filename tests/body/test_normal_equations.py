@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from hnerf.body.normal_equations import NormalEquations
 
@@ -24,37 +25,24 @@ def random_problem(frames: int, unknowns: int, shared: int) -> tuple[NormalEquat
     return equations, dense, gradient
 
 
-def free(count: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.full(count, -np.inf), np.full(count, np.inf)
-
-
-def test_the_banded_step_matches_the_dense_solution() -> None:
-    equations, dense, gradient = random_problem(6, 4, 3)
-    frame, shared = equations.step(0.0, *free(3))
-    np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(dense, gradient), atol=1e-10)
-
-
-def test_damping_scales_the_diagonal_without_the_coupling_between_frames() -> None:
-    equations, dense, gradient = random_problem(4, 2, 2)
+@pytest.mark.parametrize(("frames", "damping"), [(6, 0.0), (1, 0.0), (4, 0.5)])
+def test_the_banded_step_matches_the_dense_solution(frames: int, damping: float) -> None:
+    """This includes a single frame, without neighbours. Damping scales the diagonal without the coupling between
+    frames."""
+    equations, dense, gradient = random_problem(frames, 4, 2)
     equations.coupling_diagonal[:] = 5.0
-    frame, shared = equations.step(0.5, *free(2))
-    coupling = np.append(np.full(8, 5.0), [0, 0])
-    damped = dense + 0.5 * np.diag(np.diag(dense) - coupling)
+    frame, shared = equations.step(damping, np.full(2, -np.inf), np.full(2, np.inf))
+    coupling = np.append(np.full(4 * frames, 5.0), [0, 0])
+    damped = dense + damping * np.diag(np.diag(dense) - coupling)
     np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(damped, gradient), atol=1e-10)
-
-
-def test_a_single_frame_is_solved_without_neighbours() -> None:
-    equations, dense, gradient = random_problem(1, 4, 2)
-    frame, shared = equations.step(0.0, *free(2))
-    np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(dense, gradient), atol=1e-10)
 
 
 def test_a_shared_unknown_stops_at_its_bound_and_the_others_are_optimal() -> None:
     equations, dense, gradient = random_problem(4, 2, 2)
     wanted = -np.linalg.solve(dense, gradient)[-2]
-    low, high = (np.array([wanted / 2, -np.inf]), np.array([np.inf, np.inf])) if wanted < 0 else (
-        np.array([-np.inf, -np.inf]), np.array([wanted / 2, np.inf]))  # fmt: skip
-    frame, shared = equations.step(0.0, low, high)
+    bounds = np.array([[-np.inf] * 2, [np.inf] * 2])
+    bounds[int(wanted > 0), 0] = wanted / 2
+    frame, shared = equations.step(0.0, *bounds)
     np.testing.assert_allclose(shared[0], wanted / 2)
     rest = np.delete(np.arange(10), 8)
     best = np.linalg.solve(dense[np.ix_(rest, rest)], -gradient[rest] - dense[rest, 8] * wanted / 2)
