@@ -22,16 +22,17 @@ def random_pose(rig: Rig, frames: int) -> Pose:
     return Pose(rig, theta, root, 0.01 * torch.randn(25, 3, generator=generator, dtype=torch.float64))
 
 
-def check_gradient(
-    pose: Pose, cost_and_equations: Callable[[Pose], tuple[float, NormalEquations]], rtol: float, least: float
-) -> None:
-    """Assert that the gradient along a random direction matches the cost's finite difference, and is larger than
-    `least`."""
-    shape, generator = (len(pose.theta), Articulation(pose.rig).unknowns), torch.Generator().manual_seed(0)
-    direction = torch.randn(*shape, generator=generator, dtype=torch.float64)
-    moved = (Articulation(pose.rig).apply_step(pose, sign * 1e-6 * direction) for sign in (1, -1))
-    above, below = (cost_and_equations(end)[0] for end in moved)
-    slope = (cost_and_equations(pose)[1].frame_gradient * direction.numpy()).sum()
+def check_gradient(pose: Pose, add: Callable[[NormalEquations, Pose], float], rtol: float, least: float) -> None:
+    """Assert that the gradient that a term adds, along a random direction, matches the finite difference of the cost it
+    returns, and is larger than `least`."""
+    articulation, frames = Articulation(pose.rig), len(pose.theta)
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.randn(frames, articulation.unknowns, generator=generator, dtype=torch.float64)
+    here, *around = (NormalEquations(frames, articulation.unknowns, len(pose.rig.beta)) for _ in range(3))
+    moved = (articulation.apply_step(pose, sign * 1e-6 * direction) for sign in (1, -1))
+    above, below = map(add, around, moved)
+    add(here, pose)
+    slope = (here.frame_gradient * direction.numpy()).sum()
     assert abs(slope) > least
     np.testing.assert_allclose(slope, (above - below) / 2e-6, rtol=rtol)
 

