@@ -4,13 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
 from hnerf.body.articulation import Pose
+from hnerf.body.body_model import body_model
+from hnerf.body.fit import make_problem
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import rotation_from_axis_angle
+from hnerf.body.keypoint_fit import Problem
+from hnerf.body.observations import observe, runs
+from hnerf.body.pose_prior import Smoothness
+from hnerf.body.rig import joint_transforms, rotation_from_axis_angle
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
+from hnerf.config import FitSettings
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
 
@@ -59,6 +66,18 @@ def true_pose(body: BodyFit) -> Pose:
     """Return the poses of a body in double precision, as used by the fit."""
     rig, nothing = body.rig.to(dtype=torch.float64), torch.zeros(25, 3, dtype=torch.float64)
     return Pose(rig, body.theta.double(), body.root.double(), nothing)
+
+
+def joints_m(body: BodyFit | Pose) -> Tensor:
+    """Return the posed joints, (n, J, 3) world."""
+    return joint_transforms(body.rig, body.theta, body.root)[..., :3, 3].double()
+
+
+def problem_at(pose: Pose, capture: Capture, acceleration_mps2: float, proportions: float) -> Problem:
+    """Return the least-squares problem of a fit at a pose."""
+    settings, observations = FitSettings(), observe(capture)
+    smoothness = Smoothness(runs(capture), capture.fps, np.full(25, acceleration_mps2))
+    return make_problem(body_model(settings), pose, observations, smoothness, settings, 1, proportions)
 
 
 def record(root: Path, body: BodyFit, cameras: dict[str, Camera], train: tuple[str, ...]) -> Capture:

@@ -8,19 +8,14 @@ import pytest
 import torch
 
 from hnerf.body.articulation import Pose
-from hnerf.body.body_model import body_model
 from hnerf.body.clothed_fit import _with_more_cloth, match_clothed, refine_with_clothing, solve_cloth_offset
 from hnerf.body.contour_fit import ContourResiduals, Outline, outline
 from hnerf.body.descriptor import normals_of
-from hnerf.body.fit import make_problem
 from hnerf.body.keypoint_fit import Problem
-from hnerf.body.observations import observe, runs
-from hnerf.body.pose_prior import Smoothness
-from hnerf.body.rig import joint_transforms
 from hnerf.config import FitSettings
 from hnerf.geometry.silhouette import silhouette
-from tests.body.recorded_body import RING, moving_body, record, ring_camera, true_pose
-from tests.body.test_contour_fit import SCALE_M, SEEN_PX, ball, disc
+from tests.body.recorded_body import RING, joints_m, moving_body, problem_at, record, true_pose
+from tests.body.test_contour_fit import SCALE_M, SEEN_PX, disc, matched
 
 
 def test_cloth_offsets_are_smooth_between_neighbours() -> None:
@@ -60,19 +55,11 @@ def test_many_matches_outweigh_the_smoothness_prior() -> None:
         np.testing.assert_allclose(found, worn_m, rtol=1e-4)
 
 
-def matched(edge: Outline) -> tuple[ContourResiduals, np.ndarray]:
-    """Return the match of a ball of 0.2 m in front of a camera with an outline, and the outward directions of the
-    matched vertices."""
-    vertices, faces = ball(0.2, 1.0)
-    rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
-    return rows, (vertices[rows.vertices] - (0, 0, 1)) / 0.2
-
-
 @pytest.mark.parametrize("grow_px", [2, -2])
 def test_outlines_pull_inwards_and_outwards_alike(grow_px: int) -> None:
     """A ball 2 px too small or too large has residuals of 2 px, with weights 1 / (1 + (residual / 2 cm)^2)^2."""
     edge = outline(disc(SEEN_PX + grow_px), 1.0)
-    rows, outwards = matched(edge)
+    rows, outwards = matched(edge, match_clothed)
     assert len(rows.vertices) > 0.9 * len(edge.points_px)
     assert np.median(rows.residual_m) == pytest.approx(-grow_px * SCALE_M, abs=SCALE_M)
     np.testing.assert_allclose(rows.weight, (1 + (rows.residual_m / 0.02) ** 2) ** -2)
@@ -81,31 +68,27 @@ def test_outlines_pull_inwards_and_outwards_alike(grow_px: int) -> None:
 
 def test_distant_outlines_are_not_matched() -> None:
     """5 px of 1.07 cm each are more than the limit of 4 cm."""
-    assert len(matched(outline(disc(SEEN_PX + 5), 1.0))[0].vertices) == 0
+    assert len(matched(outline(disc(SEEN_PX + 5), 1.0), match_clothed)[0].vertices) == 0
 
 
 def test_outlines_with_opposite_normals_are_not_matched() -> None:
     edge = outline(disc(SEEN_PX), 1.0)
-    assert len(matched(replace(edge, normals=-edge.normals))[0].vertices) == 0
+    assert len(matched(replace(edge, normals=-edge.normals), match_clothed)[0].vertices) == 0
 
 
 def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pose, list[list[Outline | None]]]:
     """Return a fit problem with true keypoints, the true pose, and outlines of a body with 2 cm of cloth on its
     front."""
-    truth, settings = moving_body(tuple(range(frames))), FitSettings()
-    names = tuple(str(k) for k in range(cameras))
-    capture = record(folder, truth, {name: RING[name] for name in names}, names)
-    seen = observe(capture)
+    truth, names = moving_body(tuple(range(frames))), tuple(str(k) for k in range(cameras))
     pose = true_pose(truth)
-    smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 300.0))
-    problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=1)
+    problem = problem_at(pose, record(folder, truth, {name: RING[name] for name in names}, names), 300.0, 1)
     faces = truth.rig.faces.numpy()
     edges: list[list[Outline | None]] = []
     front = (normals_of(truth.rig.vertices_m.numpy(), faces)[:, 1] < 0)[:, None]
     for row, vertices_m in enumerate(truth.vertices_m().numpy()):
         worn_m = vertices_m + 0.02 * front * normals_of(vertices_m, faces)
-        spacing_px = settings.spacing_m / problem.scale_m[:, row].numpy()
-        masks = [silhouette(camera, worn_m, faces) for camera in seen.cameras]
+        spacing_px = FitSettings().spacing_m / problem.scale_m[:, row].numpy()
+        masks = [silhouette(camera, worn_m, faces) for camera in problem.observations.cameras]
         edges.append([outline(mask, px) for mask, px in zip(masks, spacing_px, strict=True)])
     return problem, pose, edges
 
@@ -115,8 +98,7 @@ def test_clothes_common_to_all_frames_hardly_displace_the_body(tmp_path: Path, m
     monkeypatch.setattr("hnerf.body.clothed_fit.CLOTHED_STEPS", 3)
     problem, pose, edges = clothed_scene(tmp_path, 8, 4)
     found = refine_with_clothing(problem, pose, edges, threads=1)
-    places = [joint_transforms(p.rig, p.theta, p.root)[:, p.rig.free, :3, 3] for p in (found, pose)]
-    assert 0.005 < (places[0] - places[1]).norm(dim=-1).mean() < 0.012
+    assert 0.005 < (joints_m(found) - joints_m(pose))[:, pose.rig.free].norm(dim=-1).mean() < 0.012
 
 
 @pytest.mark.parametrize(("frames", "cameras"), [(8, 1), (7, 2)])

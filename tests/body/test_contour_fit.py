@@ -1,4 +1,6 @@
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,6 +26,7 @@ from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
 SETTINGS = FitSettings(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
+NAKED = partial(match, settings=SETTINGS)
 SCALE_M = 3 / 281.6  # metres per pixel at 3 m with the focal length of `ring_camera`
 SEEN_PX = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)  # radius of a ball of 0.2 m in the image
 
@@ -46,12 +49,11 @@ def disc(radius_px: float, size_px: int = 256) -> np.ndarray:
     return (x - size_px / 2) ** 2 + (y - size_px / 2) ** 2 < radius_px**2
 
 
-def matched(mask: np.ndarray) -> tuple[ContourResiduals, np.ndarray]:
-    """Return the match of a ball of 0.2 m in front of a camera with a mask, and the outward directions of the matched
-    vertices."""
+def matched(edge: Outline, match: Callable[..., ContourResiduals] = NAKED) -> tuple[ContourResiduals, np.ndarray]:
+    """Return the match of a ball of 0.2 m in front of a camera with an outline, and the outward directions of the
+    matched vertices."""
     vertices, faces = ball(0.2, 1.0)
-    normals, camera = normals_of(vertices, faces), ring_camera("a", 0.3)
-    rows = match(camera, outline(mask, 1.0), SCALE_M, vertices, normals, faces, SETTINGS)
+    rows = match(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
     return rows, (vertices[rows.vertices] - (0, 0, 1)) / 0.2
 
 
@@ -92,7 +94,7 @@ def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() ->
     """A ball of 0.2 m at 3 m with a focal length of 281.6 px has a radius of 18.8 px. The masks are 5 px larger and
     smaller."""
     for grow_px, sigma_m in ((5, 0.02), (-5, 0.01)):
-        rows, outwards = matched(disc(SEEN_PX + grow_px))
+        rows, outwards = matched(outline(disc(SEEN_PX + grow_px), 1.0))
         assert len(rows.vertices) > 20
         np.testing.assert_allclose(np.abs(rows.residual_m).max(), 5 * SCALE_M, atol=0.6 * SCALE_M)
         assert (-np.sign(grow_px) * rows.residual_m > 2 * SCALE_M).all()  # rim vertices lie up to 2.5 px inside
@@ -103,7 +105,7 @@ def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() ->
 
 
 def test_a_body_that_fills_its_mask_is_not_moved() -> None:
-    assert np.abs(matched(disc(SEEN_PX))[0].residual_m).max() < SCALE_M
+    assert np.abs(matched(outline(disc(SEEN_PX), 1.0))[0].residual_m).max() < SCALE_M
 
 
 def test_the_push_of_vertices_outside_the_mask_is_bounded() -> None:
@@ -111,7 +113,7 @@ def test_the_push_of_vertices_outside_the_mask_is_bounded() -> None:
     with 1.345 / 0.01 m."""
     seen = disc(SEEN_PX)
     seen[:, 128:] = False
-    rows, _ = matched(seen)
+    rows, _ = matched(outline(seen, 1.0))
     out = rows.residual_m > 0.01345
     assert rows.residual_m[out].min() < 0.04 and rows.residual_m[out].max() > 0.18
     np.testing.assert_allclose((rows.weight * rows.residual_m)[out], 134.5)

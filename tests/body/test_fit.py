@@ -14,7 +14,6 @@ from hnerf.body.fit import (
     _warn_of_stature,
     fit_body,
     initial_pose,
-    make_problem,
     resolve_depth_flips,
 )
 from hnerf.body.fit_result import BodyFit
@@ -22,11 +21,10 @@ from hnerf.body.ground import Ground
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
-from hnerf.body.rig import joint_transforms
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from tests.body import recorded_body
-from tests.body.recorded_body import moving_body, record, ring_camera, silhouettes, true_pose
+from tests.body.recorded_body import joints_m, moving_body, problem_at, record, ring_camera, silhouettes, true_pose
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 from tests.calibration.synthetic import edited_keypoints
@@ -42,8 +40,7 @@ def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def joint_error_m(a: BodyFit, b: BodyFit) -> torch.Tensor:
     """Return distances (n, free joints) between the joints of two fits."""
-    where = [joint_transforms(body.rig, body.theta, body.root)[..., :3, 3] for body in (a, b)]
-    return (where[0] - where[1]).norm(dim=-1)[:, a.rig.free]
+    return (joints_m(a) - joints_m(b)).norm(dim=-1)[:, a.rig.free]
 
 
 @pytest.mark.usefixtures("few_steps")
@@ -152,12 +149,9 @@ def test_with_one_camera_the_soles_stand_on_the_ground(tmp_path: Path, monkeypat
 
 @pytest.mark.usefixtures("few_steps")
 def test_an_arm_mirrored_in_depth_is_corrected_from_neighbouring_frames(tmp_path: Path) -> None:
-    truth, settings = moving_body((0, 1, 2)), FitSettings()
-    capture = record(tmp_path, truth, RING, ("0",))
-    seen = observe(capture)
-    smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 30.0))
-    pose = true_pose(truth)
-    problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=0.1)
+    truth = moving_body((0, 1, 2))
+    capture, pose = record(tmp_path, truth, RING, ("0",)), true_pose(truth)
+    problem = problem_at(pose, capture, 30.0, 0.1)
     problem = replace(problem, reshape=pose.rig.reshaped)  # faster: anny's own reshaping takes half of a step
     pose = levenberg_marquardt(problem, pose, problem.image_term, 15)
     mirrored_theta = pose.theta.clone()
@@ -166,8 +160,7 @@ def test_an_arm_mirrored_in_depth_is_corrected_from_neighbouring_frames(tmp_path
     wrist = truth.rig.joint_names.index("wrist.L")
 
     def off_m(found: Pose) -> float:
-        where = [joint_transforms(p.rig, p.theta, p.root)[1, wrist, :3, 3] for p in (found, pose)]
-        return float((where[0] - where[1]).norm())
+        return float((joints_m(found) - joints_m(pose))[1, wrist].norm())
 
     assert off_m(mirrored) > 0.5  # descent alone does not leave this minimum
     mended = resolve_depth_flips(problem, mirrored, runs(capture))

@@ -5,21 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from hnerf.body.articulation import Pose
 from hnerf.body.body_model import body_model
 from hnerf.body.fit import fit_body
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import initial_pose_from_given
-from hnerf.body.rig import joint_transforms
 from hnerf.calibration.check import check_calibration
 from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.given_poses import GivenPoses
 from hnerf.config import CalibrationSettings, FitSettings, SegmentationSettings
 from hnerf.segmentation.segment import segment
 from tests.body.made_up_smpl import write_smpl
-from tests.body.recorded_body import RING, moving_body, record, ring_camera, silhouettes
+from tests.body.recorded_body import RING, joints_m, moving_body, record, ring_camera, silhouettes
 
 LIMBS = tuple(f"{bone}.{side}" for bone in ("upperarm01", "lowerarm01", "upperleg01", "lowerleg01") for side in "LR")
 ENDS = tuple(f"{end}.{side}" for end in ("lowerarm01", "wrist", "lowerleg01", "foot") for side in "LR")
@@ -39,10 +36,6 @@ def parameters() -> GivenPoses:
     root = np.tile(np.eye(4), (3, 1, 1))
     root[:, :3, :3], root[:, :3, 3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]], [0.1, 0, 1.2]
     return GivenPoses(theta, root, np.array([0.5, -0.5, 0.5, *[0.0] * 7]))
-
-
-def joints_m(body: BodyFit | Pose) -> Tensor:
-    return joint_transforms(body.rig, body.theta, body.root)[..., :3, 3].double()
 
 
 def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture, BodyFit]:

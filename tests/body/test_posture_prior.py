@@ -9,16 +9,13 @@ import torch
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.balance import Balance, centre_of_mass_over_feet
-from hnerf.body.body_model import body_model
-from hnerf.body.fit import hold_single_posture, make_problem
+from hnerf.body.fit import hold_single_posture
 from hnerf.body.keypoint_fit import Problem, levenberg_marquardt
 from hnerf.body.normal_equations import NormalEquations
-from hnerf.body.observations import observe, runs
-from hnerf.body.pose_prior import PosePrior, Smoothness
+from hnerf.body.pose_prior import PosePrior
 from hnerf.body.posture_prior import PosturePrior, view_direction_variance
 from hnerf.body.rig import rotation_from_axis_angle
-from hnerf.config import FitSettings
-from tests.body.recorded_body import moving_body, record, ring_camera, true_pose
+from tests.body.recorded_body import moving_body, problem_at, record, ring_camera, true_pose
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
@@ -164,13 +161,11 @@ def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
         swing = math.radians(sway_deg) * torch.tensor([(-1.0) ** k for k in range(8)])
         theta[:, still.rig.joint_names.index(bone), 0] = swing
     truth = replace(still, frames=tuple(range(8)), theta=theta, root=root)
-    capture, settings = record(folder, truth, {"0": ring_camera("0", 0.3)}, ("0",)), FitSettings()
-    seen = observe(capture)
-    noise = torch.randn(seen.pixels.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    seen = replace(seen, pixels=seen.pixels + 2 * noise)
+    capture = replace(record(folder, truth, {"0": ring_camera("0", 0.3)}, ("0",)), fps=10.0)
     begin = true_pose(truth)
-    smoothness = Smoothness(runs(capture), 10.0, np.full(25, 30.0))
-    problem = make_problem(body_model(settings), begin, seen, smoothness, settings, 1, 0.1)
+    problem = problem_at(begin, capture, 30.0, 0.1)
+    pixels = problem.observations.pixels
+    pixels += 2 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return replace(problem, reshape=begin.rig.reshaped), begin  # faster: anny's own reshaping takes half of a step
 
 

@@ -13,13 +13,13 @@ from hnerf.body.body_model import body_model
 from hnerf.body.fit import fit_body
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import initial_pose_from_given
-from hnerf.body.rig import joint_transforms, pose_vertices
+from hnerf.body.rig import pose_vertices
 from hnerf.body.smpl import read_smpl
 from hnerf.capture.given_poses import GivenPoses
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from tests.body.made_up_smpl import LEFT_ELBOW, PARENTS, made_up_smpl, write_smpl
-from tests.body.recorded_body import RING, record
+from tests.body.recorded_body import RING, joints_m, record
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_given_smpl_parameters_reproduce_smpls_joints_and_vertices(model_file: P
     """Joints agree exactly, and so do vertices that follow a single joint and that no pose blend shape moves."""
     model, given = body_model(FitSettings(body_model=model_file)), random_parameters()
     pose = initial_pose_from_given(given, model, (0, 1))
-    joints = joint_transforms(pose.rig, pose.theta, pose.root)[..., :3, 3].numpy()
+    joints = joints_m(pose).numpy()
     vertices = pose_vertices(pose.rig, pose.theta, pose.root).numpy()
     weights, posedirs = made_up_smpl()["weights"], made_up_smpl()["posedirs"]
     rigid = (weights.max(1) == 1) & ~posedirs.any((1, 2))
@@ -131,8 +131,7 @@ def test_a_fit_to_its_own_keypoints_recovers_pose_and_shape(model_file: Path, tm
     truth = BodyFit(rig.to(dtype=torch.float32), (0, 1, 2), theta, root)
     capture = record(tmp_path, truth, RING, tuple(RING))
     fit, report = fit_body(capture, None, FitSettings(body_model=model_file))
-    joints = [joint_transforms(b.rig, b.theta, b.root)[..., :3, 3] for b in (fit, truth)]
-    assert float((joints[0] - joints[1]).norm(dim=-1).max()) < 0.02
+    assert float((joints_m(fit) - joints_m(truth)).norm(dim=-1).max()) < 0.02
     assert float((fit.rig.beta - truth.rig.beta).abs()[:4].max()) < 0.4 and max(report["keypoint_residual_px"]) < 1
 
 
