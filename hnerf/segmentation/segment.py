@@ -37,13 +37,9 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     for name, prior_of in tracked(priors, "segmentation", len(capture.train_cameras)):
         backend = choose_backend(capture, name, prior_of, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
-        verdicts, bodies_px = [], []
-        looks = side_by_side(partial(_look, capture, backend, prior_of), range(len(capture.frames)))
-        for frame, look in zip(capture.frames, looks, strict=True):
-            verdicts.append(look.verdict)
-            bodies_px.append(look.body_px)
-            encoded[name, frame] = look.encoded
-        cameras[name] = {"backend": backend.name} | _findings(capture, name, verdicts, bodies_px)
+        looks = list(side_by_side(partial(_look, capture, backend, prior_of), range(len(capture.frames))))
+        cameras[name] = {"backend": backend.name} | _findings(capture, name, looks)
+        encoded |= {(name, frame): look.encoded for frame, look in zip(capture.frames, looks, strict=True)}
         for row in cameras[name]["dropped"]:
             del encoded[name, row["frame"]]
     return Masks(encoded, {"cameras": cameras})
@@ -63,12 +59,12 @@ def _look(capture: Capture, backend: Backend, prior_of: PriorOf, number: int) ->
     return _Look(encode(mask), judge_mask(mask, prior), int(prior.body.sum()))
 
 
-def _findings(capture: Capture, camera: str, verdicts: list[MaskVerdict], bodies_px: list[int]) -> dict[str, Any]:
+def _findings(capture: Capture, camera: str, looks: list[_Look]) -> dict[str, Any]:
     """Return plain values: the median area, and the frames that are dropped or noted, each with its reason."""
-    sudden = area_jumps(capture.frames, verdicts, bodies_px)
+    sudden = area_jumps(capture.frames, [look.verdict for look in looks], [look.body_px for look in looks])
     judged = {
-        frame: dataclasses.replace(verdict, fault=verdict.fault or sudden.get(frame))
-        for frame, verdict in zip(capture.frames, verdicts, strict=True)
+        frame: dataclasses.replace(look.verdict, fault=look.verdict.fault or sudden.get(frame))
+        for frame, look in zip(capture.frames, looks, strict=True)
     }
     dropped = [{"frame": frame, "reason": v.fault} for frame, v in judged.items() if v.fault]
     if len(dropped) == len(judged):
