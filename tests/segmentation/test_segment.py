@@ -97,11 +97,7 @@ def test_masked_median_by_hand() -> None:
     # upper one. The second pixel is never free, and is inpainted from the first.
     values, hidden = [10, 200, 200, 30, 200], [False, True, True, False, True]
     images = [np.full((1, 2, 3), value, np.uint8) for value in values]
-    priors = []
-    for is_hidden in hidden:
-        near = np.array([[is_hidden, True]])
-        priors.append(Prior(near, near, near, near, 1.0))
-    plate, known = masked_median(images, [prior.near for prior in priors])
+    plate, known = masked_median(images, [np.array([[is_hidden, True]]) for is_hidden in hidden])
     assert plate[0].tolist() == [[30, 30, 30], [30, 30, 30]]
     assert known.tolist() == [[True, False]]
 
