@@ -37,17 +37,12 @@ def split_frames(capture: Capture, split: str) -> tuple[int, ...]:
     return capture.novel_pose_frames if split in NOVEL_POSE_SPLITS else capture.train_frames
 
 
-def split_cameras(capture: Capture, split: str) -> tuple[str, ...]:
-    """Return the cameras of a split: the test cameras. A capture without any shows novel poses from its training
-    cameras, for inspection only."""
-    if split == TRAINING_VIEW or (split in NOVEL_POSE_SPLITS and not capture.test_cameras):
-        return capture.train_cameras
-    return capture.test_cameras
-
-
 def all_views(capture: Capture, split: str) -> list[View]:
-    """Return every image of a split."""
-    return [View(split, c, f) for c in split_cameras(capture, split) for f in split_frames(capture, split)]
+    """Return every image of a split, from the test cameras. A capture without any shows novel poses from its training
+    cameras, for inspection only."""
+    seen_in_training = split == TRAINING_VIEW or (split in NOVEL_POSE_SPLITS and not capture.test_cameras)
+    cameras = capture.train_cameras if seen_in_training else capture.test_cameras
+    return [View(split, camera, frame) for camera in cameras for frame in split_frames(capture, split)]
 
 
 def sample_views(views: list[View], count: int) -> list[View]:
