@@ -15,7 +15,7 @@ from hnerf.asset.skeleton import Bones
 from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
-from hnerf.geometry.axes import Y_UP_FROM_Z_UP
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP, y_up_from
 from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
 
@@ -128,7 +128,7 @@ def stage_avatar(
     joints in the same world with their frame rates, by name; albedo: with its light in the world; level_faces: face
     counts of the lower levels of detail; expressions_m, physiques_m (V, 3): of the face and of other bodies, in the
     body's axes."""
-    world, rig, body = stage_from_world(up), clothed.rig, Y_UP_FROM_Z_UP
+    world, rig, body = y_up_from(up), clothed.rig, Y_UP_FROM_Z_UP
     rest_m, joints_m = rig.vertices_m.double().numpy() @ body.T, rig.joints_m.double().numpy() @ body.T
     stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
     rest = RestSurface(rest_m - stands_m, correctives.offsets_m @ body.T.astype(np.float32))
@@ -173,11 +173,6 @@ def moved_points(offsets_m: np.ndarray) -> np.ndarray:
     list for all points."""
     moved = np.flatnonzero(np.abs(offsets_m).max(1) > STILL_M)
     return moved if len(moved) else np.zeros(1, np.int64)
-
-
-def stage_from_world(up: str) -> np.ndarray:
-    """Return the rotation (3, 3) from world axes to Y up."""
-    return {"z": Y_UP_FROM_Z_UP, "y": np.eye(3)}[up]
 
 
 def opengl_pose(camera: Camera, stage_from_world: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.config import FitSettings
 from hnerf.errors import InputError, raise_if_unreachable
-from hnerf.geometry.axes import Y_UP_FROM_Z_UP
+from hnerf.geometry.axes import y_up_from
 from hnerf.geometry.rotations import slerp
 from hnerf.progress import tracked
 from hnerf.render.bvh_motion import bvh_motion
@@ -107,7 +107,7 @@ def retarget(own: BodyFit, motion: Motion, up: str, source: object = "motion") -
         elif own.rig.free[j]:
             raise InputError(f"{source}: has no joint {name}; use a motion that was fitted with this body model")
     turn = torch.eye(4)
-    turn[:3, :3] = _rotation_between_up_axes(motion.up, up)
+    turn[:3, :3] = torch.from_numpy(y_up_from(up).T @ y_up_from(motion.up))
     placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)
     hips_m = middle_of_hips_m(other) @ turn[:3, :3].T
     placed = set_middle_of_hips(placed, hips_m + middle_of_hips_m(own).mean(0) - hips_m.mean(0))
@@ -163,13 +163,6 @@ def _translated(body: BodyFit, move_m: Tensor) -> BodyFit:
     root = body.root.clone()
     root[:, :3, 3] += move_m
     return dataclasses.replace(body, root=root)
-
-
-def _rotation_between_up_axes(from_up: str, to_up: str) -> Tensor:
-    """Return the rotation (3, 3) about x that takes one world's vertical axis to the other's."""
-    if from_up == to_up:
-        return torch.eye(3)
-    return torch.from_numpy(Y_UP_FROM_Z_UP.T if from_up == "y" else Y_UP_FROM_Z_UP).float()
 
 
 def _subject_motion(folder: Path, frames: str) -> Motion:

@@ -5,15 +5,16 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from hnerf.asset.levels import Level
-from hnerf.asset.staging import StagedAvatar, stage_from_world
+from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.texture import UvLayout
 from hnerf.asset.usd import define_camera, define_mesh
+from hnerf.geometry.axes import y_up_from
 from tests.asset.figure import side_camera
 
 
 def test_usd_camera_parameters_by_hand() -> None:
     stage = Usd.Stage.CreateInMemory()
-    camera = define_camera(stage, Sdf.Path("/Camera"), side_camera(), stage_from_world("z"))
+    camera = define_camera(stage, Sdf.Path("/Camera"), side_camera(), y_up_from("z"))
     # fx = 500 px of 640 across a gate of 0.36: 0.28125. H / fy x focal = 480 / 400 x 0.28125 = 0.3375.
     assert camera.GetHorizontalApertureAttr().Get() == pytest.approx(0.36)
     assert camera.GetFocalLengthAttr().Get() == pytest.approx(0.28125)
@@ -29,9 +30,9 @@ def test_usd_camera_parameters_by_hand() -> None:
 def test_usd_camera_projects_like_ours() -> None:
     ours, world = side_camera(), np.array([0.4, 0.7, 1.3])
     stage = Usd.Stage.CreateInMemory()
-    frustum = define_camera(stage, Sdf.Path("/Camera"), ours, stage_from_world("z")).GetCamera().frustum
+    frustum = define_camera(stage, Sdf.Path("/Camera"), ours, y_up_from("z")).GetCamera().frustum
     ndc = (frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()).Transform(
-        Gf.Vec3d(*(stage_from_world("z") @ world).tolist())
+        Gf.Vec3d(*(y_up_from("z") @ world).tolist())
     )
     pixel = np.array([(ndc[0] + 1) / 2 * 640 - 0.5, (1 - ndc[1]) / 2 * 480 - 0.5])
     np.testing.assert_allclose(pixel, ours.project(world)[0], atol=1e-4)
