@@ -52,7 +52,7 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
     rate, lasts = frame_times([frame for _, frame in shots], fps)
     for kind in [kind for kind in what if kind != "mesh"]:
         read = partial(read_depth_grey, span_mm=depth_span_mm(out / kind)) if kind == "depth" else read_rgb
-        write_video(out / kind, rate, out / f"{kind}.mp4", read, lasts)
+        write_video(out / kind, rate, lasts, out / f"{kind}.mp4", read)
 
 
 def frame_times(frames: Sequence[int], fps: float) -> tuple[float, list[int]]:
@@ -66,21 +66,16 @@ def frame_times(frames: Sequence[int], fps: float) -> tuple[float, list[int]]:
 
 
 def write_video(
-    folder: Path,
-    fps: float,
-    path: Path,
-    read: Callable[[Path], np.ndarray] = read_rgb,
-    lasts: Sequence[int] | None = None,
+    folder: Path, fps: float, lasts: Sequence[int], path: Path, read: Callable[[Path], np.ndarray] = read_rgb
 ) -> None:
     """Encode the PNG files of a folder, in order, as an MPEG-4 video of at least MIN_FPS; `read` loads each as (H, W,
-    3) uint8 RGB. lasts: how many frames of the video each is shown for; None: one. Raises OSError if not all frames
-    can be read back."""
+    3) uint8 RGB. lasts: how many frames of the video each is shown for. Raises OSError if not all frames can be read
+    back."""
     files = sorted(folder.glob("*.png"))
     height_px, width_px = read(files[0]).shape[:2]
     fps = max(fps, MIN_FPS)  # two frames may be an hour apart; below about 0.001, no file would be written
     fps = round(fps, max(0, int(math.log10(65535 / fps))))  # MPEG-4's clock has at most 65535 ticks a second
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
-    lasts = lasts or [1] * len(files)
     for file, times in zip(files, lasts, strict=True):
         picture = cv2.cvtColor(read(file), cv2.COLOR_RGB2BGR)
         for _ in range(times):

@@ -30,8 +30,7 @@ class SolidBall(BallAvatar):
     """The ball, rendered with depths; in frame 0 it is 0.65 m from the camera."""
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
-        pixels = np.stack(np.meshgrid(np.arange(SIZE_PX), np.arange(SIZE_PX)), -1).astype(np.float64)
-        origins, directions = camera.rays(pixels)
+        origins, directions = camera.rays(camera.pixels_px)
         towards = root[:3, 3].numpy() - origins
         middle = (towards * directions).sum(-1)
         inside = RADIUS_M**2 - (towards**2).sum(-1) + middle**2
@@ -41,8 +40,7 @@ class SolidBall(BallAvatar):
 
 
 def test_depth_is_measured_along_the_viewing_axis() -> None:
-    pixels = np.stack(np.meshgrid(np.arange(SIZE_PX), np.arange(SIZE_PX)), -1).astype(np.float64)
-    oblique = 1 / (CAMERA.rays(pixels)[1] @ CAMERA.forward)  # a wall 2 m ahead is further along slanting rays
+    oblique = 1 / (CAMERA.rays(CAMERA.pixels_px)[1] @ CAMERA.forward)  # a wall 2 m ahead is further along slanting rays
     alpha = torch.ones(SIZE_PX, SIZE_PX)
     alpha[0, 0] = 0.4
     depth = depth_image(Rendering(torch.zeros(SIZE_PX, SIZE_PX, 3), alpha, torch.from_numpy(2 * oblique)), CAMERA)
@@ -131,7 +129,7 @@ def test_a_video_has_the_frame_rate_as_exactly_as_the_format_allows(fps: float, 
     (tmp_path / "colour").mkdir()
     for number in range(2):
         cv2.imwrite(str(tmp_path / "colour" / f"{number:06d}.png"), np.zeros((16, 16, 3), np.uint8))
-    write_video(tmp_path / "colour", fps, tmp_path / "colour.mp4")
+    write_video(tmp_path / "colour", fps, [1, 1], tmp_path / "colour.mp4")
     assert Video.open(tmp_path / "colour.mp4").fps == pytest.approx(max(fps, 0.01), rel=1e-3)
 
 
@@ -176,4 +174,4 @@ def test_a_video_that_lost_frames_is_an_error(tmp_path: Path, monkeypatch: pytes
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((16, 16, 3), np.uint8))
     monkeypatch.setattr(pictures.Video, "open", lambda path: Video(path, (0, 1), 5.0))
     with pytest.raises(OSError, match="2 of 3 frames"):
-        write_video(tmp_path, 5.0, tmp_path / "colour.mp4")
+        write_video(tmp_path, 5.0, [1, 1, 1], tmp_path / "colour.mp4")
