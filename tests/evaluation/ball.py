@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 import trimesh
@@ -14,7 +13,7 @@ from torch import Tensor
 from hnerf.avatar.avatar import Rendering
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks, encode
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.geometry.camera import Camera
@@ -63,8 +62,7 @@ def centre_m(frame: int) -> np.ndarray:
 
 def ball_mask(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
     """Return the mask (H, W) bool of pixels whose rays hit the ball."""
-    pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1)
-    origins, directions = camera.rays(pixels.astype(np.float64))
+    origins, directions = camera.rays(camera.pixels_px)
     offset = np.cross(middle_m - origins, directions)
     return np.linalg.norm(offset, axis=-1) < RADIUS_M
 
@@ -113,7 +111,7 @@ def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -
     for camera in cameras.values():
         for frame in FRAMES:
             image = np.where(ball_mask(camera, centre_m(frame)), PHOTOGRAPHED, 60).astype(np.uint8)
-            _write(folder / "images" / camera.name / f"{frame:06d}.png", image)
+            write_image(folder / "images" / camera.name / f"{frame:06d}.png", image)
     (folder / "capture.toml").write_text(
         f"[cameras]\ntrain = ['a', 'b']\ntest = {list(test_cameras)}\n"
         f"[frames]\ntrain = {list(FRAMES[:-1])}\nnovel_pose = {list(NOVEL)}\n"
@@ -126,7 +124,7 @@ def write_ball_truth(capture: Capture, radius_m: float) -> None:
     for camera in capture.cameras.values():
         for frame in FRAMES:
             mask = ball_mask(camera, centre_m(frame)).astype(np.uint8) * 255
-            _write(capture.root / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", mask)
+            write_image(capture.root / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", mask)
     ball = trimesh.creation.icosphere(5, radius_m)
     vertices = (ball.vertices + centre_m(0))[None].astype(np.float32)
     path = capture.root / "ground_truth" / "meshes.npz"
@@ -138,7 +136,7 @@ def write_ball_masks(capture: Capture, camera: str) -> None:
     for frame in FRAMES:
         mask = ball_mask(capture.cameras[camera], centre_m(frame)).astype(np.uint8) * 255
         mask[:, : SIZE_PX // 2] = 0
-        _write(capture.root / "masks" / camera / f"{frame:06d}.png", mask)
+        write_image(capture.root / "masks" / camera / f"{frame:06d}.png", mask)
 
 
 def tuned(fit: BodyFit) -> BodyFit:
@@ -173,8 +171,3 @@ def ball_inputs(capture: Capture, stages: Path) -> EvaluationInputs:
         avatar=BallAvatar(fit),
         **folders,
     )
-
-
-def _write(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), image)

@@ -33,22 +33,17 @@ def test_the_animated_column_uses_the_trained_shape() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "nodes", "lacks"),
+    ("kind", "nodes", "steps", "lacks"),
     [
-        ("fast", 8, []),
-        ("fast", 0, ["novel_pose_tracked"]),
-        ("neural_body", 0, ["novel_pose_posed", "novel_pose_tracked"]),
-        ("nerf", 0, ["novel_pose", "novel_pose_posed", "novel_pose_tracked"]),
+        ("fast", 8, 80, []),
+        ("fast", 0, 80, ["novel_pose_tracked"]),
+        ("fast", 8, 0, ["novel_pose_posed", "novel_pose_tracked"]),
+        ("neural_body", 0, 80, ["novel_pose_posed", "novel_pose_tracked"]),
+        ("nerf", 0, 80, ["novel_pose", "novel_pose_posed", "novel_pose_tracked"]),
     ],
 )
-def test_untuned_novel_pose_columns_are_unavailable(tmp_path: Path, kind: str, nodes: int, lacks: list[str]) -> None:
-    write_settings(tmp_path, kind, nodes)
+def test_untuned_novel_pose_columns_are_unavailable(
+    tmp_path: Path, kind: str, nodes: int, steps: int, lacks: list[str]
+) -> None:
+    write_settings(tmp_path, kind, nodes, steps)
     assert [split for split in SPLITS if reason_unavailable(split, tmp_path)] == lacks
-
-
-def test_without_tuning_steps_only_the_animated_column_exists(tmp_path: Path) -> None:
-    write_settings(tmp_path, "fast", steps=0)
-    assert [split for split in SPLITS if reason_unavailable(split, tmp_path)] == [
-        "novel_pose_posed",
-        "novel_pose_tracked",
-    ]

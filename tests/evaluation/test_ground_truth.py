@@ -1,15 +1,17 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
+from hnerf.capture.capture import write_image
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
 from hnerf.errors import InputError
 from hnerf.evaluation.ground_truth import GroundTruth
 from tests.evaluation.ball import PHOTOGRAPHED, ball_mask, centre_m, write_ball_capture, write_ball_truth
+
+MASK = "ground_truth/masks/c/000001.png"
 
 
 @pytest.fixture
@@ -26,9 +28,7 @@ def test_without_on_black_images_the_masked_photograph_is_used(truth: GroundTrut
 
 
 def test_on_black_images_take_precedence_and_are_resized_to_the_camera(truth: GroundTruth) -> None:
-    path = truth.folder / "ground_truth" / "on_black" / "c" / "000001.jpg"
-    path.parent.mkdir(parents=True)
-    cv2.imwrite(str(path), np.full((128, 128, 3), 90, np.uint8))
+    write_image(truth.folder / "ground_truth/on_black/c/000001.jpg", np.full((128, 128, 3), 90, np.uint8))
     image, source = truth.on_black("c", 1)
     assert source == "ground_truth/on_black"
     assert np.array_equal(image, np.full((64, 64, 3), 90))
@@ -39,7 +39,7 @@ def test_a_larger_mask_is_downscaled_by_area(truth: GroundTruth) -> None:
     and the first does not."""
     mask = np.zeros((256, 256), np.uint8)
     mask[:, 5:] = 255
-    cv2.imwrite(str(truth.folder / "ground_truth" / "masks" / "c" / "000001.png"), mask)
+    write_image(truth.folder / MASK, mask)
     assert truth.mask("c", 1)[0, :3].tolist() == [False, True, True]
 
 
@@ -55,9 +55,7 @@ def bent(truth: GroundTruth) -> GroundTruth:
 def test_truth_of_another_shape_or_that_cannot_be_undistorted_is_refused(
     truth: GroundTruth, size_px: tuple[int, int], lens: bool
 ) -> None:
-    mask = np.zeros(size_px[::-1], np.uint8)
-    path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
-    cv2.imwrite(str(path), mask)
+    write_image(truth.folder / MASK, np.zeros(size_px[::-1], np.uint8))
     shown = f"{size_px[0]} x {size_px[1]} px"
     with pytest.raises(InputError, match=rf"000001\.png: is {shown}, unlike camera c; give it at the recording's size"):
         (bent(truth) if lens else truth).mask("c", 1)
@@ -67,10 +65,9 @@ def test_truth_of_the_cameras_shape_or_the_recordings_size_is_accepted(truth: Gr
     """The camera has 85 x 64 px. An image of 1024 x 768 px has the same aspect ratio up to rounding."""
     wide = replace(truth.capture.cameras["c"], width_px=85)
     odd = replace(truth, capture=replace(truth.capture, cameras={**truth.capture.cameras, "c": wide}))
-    path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
-    cv2.imwrite(str(path), np.full((768, 1024), 255, np.uint8))
+    write_image(truth.folder / MASK, np.full((768, 1024), 255, np.uint8))
     assert odd.mask("c", 1).all() and odd.mask("c", 1).shape == (64, 85)
-    cv2.imwrite(str(path), np.full((128, 128), 255, np.uint8))
+    write_image(truth.folder / MASK, np.full((128, 128), 255, np.uint8))
     assert bent(truth).mask("c", 1).shape == (64, 64)
 
 
@@ -80,9 +77,7 @@ def test_truth_is_synchronised_with_the_photograph(truth: GroundTruth) -> None:
     expected = ball_mask(truth.capture.cameras["c"], centre_m(2))
     assert np.array_equal(synchronised.mask("c", 1), expected)
     assert np.array_equal(synchronised.on_black("c", 1)[0][..., 0], expected * PHOTOGRAPHED)
-    path = truth.folder / "ground_truth" / "on_black" / "c" / "000002.jpg"
-    path.parent.mkdir(parents=True)
-    cv2.imwrite(str(path), np.full((64, 64, 3), 90, np.uint8))
+    write_image(truth.folder / "ground_truth/on_black/c/000002.jpg", np.full((64, 64, 3), 90, np.uint8))
     assert synchronised.on_black("c", 1)[0].max() == 90
 
 
@@ -101,15 +96,10 @@ def test_truth_is_undistorted_like_photographs(truth: GroundTruth) -> None:
     assert np.array_equal(found, expected) and not np.array_equal(found, straight)
 
 
-def test_has_mask_is_false_without_a_mask_file(truth: GroundTruth) -> None:
+def test_a_missing_mask_is_known_and_reported_by_name(truth: GroundTruth) -> None:
     assert truth.has_mask("c", 1)
-    (truth.folder / "ground_truth" / "masks" / "c" / "000001.png").unlink()
+    (truth.folder / MASK).unlink()
     assert not truth.has_mask("c", 1)
-
-
-def test_a_missing_mask_is_reported_by_name(truth: GroundTruth) -> None:
-    path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
-    path.unlink()
     with pytest.raises(InputError, match=r"000001\.png"):
         truth.mask("c", 1)
 
