@@ -154,21 +154,21 @@ def _parts_of(avatar: StagedAvatar, cameras: list[Camera], fps: float, prefix: s
     """Return the parts of one topology. prefix: of its images' names. Earlier parts override later ones: shapes replace
     the extents of motions."""
     view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
+    meshes = surface_paths(avatar)
+    looks = {"captured": author_captured_look} | ({"albedo": author_albedo_look} if avatar.albedo else {})
     return [
         *(
             Part(f"shape_{name}", partial(author_shape, avatar=avatar, physique=physique), fps, ("shape", name))
             for name, physique in {CAPTURED: None, **{name: name for name in avatar.physiques_m}}.items()
         ),
         *(
-            Part(
-                f"geometry_lod{level}",
-                partial(author_geometry, avatar=avatar, level=level),
-                fps,
-                ("lod", f"lod{level}"),
-            )
-            for level in range(len(avatar.levels))
+            Part(f"geometry_lod{k}", partial(author_geometry, avatar=avatar, level=k), fps, ("lod", f"lod{k}"))
+            for k in range(len(avatar.levels))
         ),
-        *_looks(avatar, fps, prefix),
+        *(
+            Part(f"look_{name}", partial(author, meshes=meshes, avatar=avatar, prefix=prefix), fps, ("look", name))
+            for name, author in looks.items()
+        ),
         Part("cameras", view, fps),
         *(
             Part(f"rig_{name}", partial(author_rig, name=name, rig=rig, levels=avatar.levels), fps, ("rig", name))
@@ -179,18 +179,6 @@ def _parts_of(avatar: StagedAvatar, cameras: list[Camera], fps: float, prefix: s
             for name, motion in avatar.rigs[FULL].motions.items()
         ),
     ]
-
-
-def _looks(avatar: StagedAvatar, fps: float, prefix: str) -> list[Part]:
-    """Return the captured look and, if there is an albedo, its look with the light."""
-    meshes = surface_paths(avatar)
-    author = partial(author_captured_look, meshes=meshes, avatar=avatar, prefix=prefix)
-    looks = [Part("look_captured", author, fps, ("look", "captured"))]
-    if avatar.albedo is not None:
-        _, intensity = avatar.albedo.dome
-        author = partial(author_albedo_look, meshes=meshes, avatar=avatar, intensity=intensity, prefix=prefix)
-        looks.append(Part("look_albedo", author, fps, ("look", "albedo")))
-    return looks
 
 
 @contextmanager
@@ -208,14 +196,11 @@ def _in_variant(stage: Usd.Stage, variant: Variant | None) -> Iterator[None]:
 
 def _select(stage: Usd.Stage, avatars: Avatars, motion: str) -> None:
     """Select the default variants: the first topology, and in each one the captured motion of the whole mesh."""
-    sets = stage.GetDefaultPrim().GetVariantSets()
+    default = {"shape": CAPTURED, "lod": "lod0", "look": "captured", "rig": FULL, "motion": motion}
     for topology in reversed(avatars):
         with _in_variant(stage, _variant(topology)):
-            sets.SetSelection("shape", CAPTURED)
-            sets.SetSelection("lod", "lod0")
-            sets.SetSelection("look", "captured")
-            sets.SetSelection("rig", FULL)
-            sets.SetSelection("motion", motion)
+            for name, variant in default.items():
+                stage.GetDefaultPrim().GetVariantSets().SetSelection(name, variant)
 
 
 def _write_interface(file: Path, parts: list[Part], avatars: Avatars, fps: float, info: AssetInfo, motion: str) -> None:

@@ -87,14 +87,12 @@ def author_captured_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: S
     _define_material(stage, "Captured", TEXTURE_NAME, meshes, avatar, prefix)
 
 
-def author_albedo_look(
-    stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, intensity: float, prefix: str = ""
-) -> None:
-    """Bind meshes to the albedo, and define the recording's light: intensity times the image LIGHT_NAME. prefix: of the
-    names of its images."""
+def author_albedo_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, prefix: str = "") -> None:
+    """Bind meshes to the albedo, and define the recording's light. prefix: of the names of its images."""
+    assert avatar.albedo is not None  # or there is no such look
     _define_material(stage, "Albedo", ALBEDO_NAME, meshes, avatar, prefix)
     light = UsdLux.DomeLight.Define(stage, ROOT.AppendChild("Light"))
-    light.CreateIntensityAttr(intensity)
+    light.CreateIntensityAttr(avatar.albedo.dome[1])
     light.CreateTextureFileAttr(f"./{prefix}{LIGHT_NAME}")
     light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
 
