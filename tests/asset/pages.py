@@ -1,15 +1,6 @@
 """The bending column's glTF file, as passed to the viewer."""
 
-from pathlib import Path
-
 from hnerf.asset.compact_glb import as_glb, read_glb
-from hnerf.asset.glb import write_glb
-from hnerf.asset.rigs import FULL
-from hnerf.asset.staging import StagedAvatar
-
-
-def write_avatar(path: Path, avatar: StagedAvatar) -> None:
-    write_glb(path, avatar, avatar.rigs[FULL])
 
 
 def with_joints_in_second_set(glb: bytes) -> bytes:

@@ -19,10 +19,6 @@ def seen(normal: np.ndarray, colours: np.ndarray) -> SeenTexels:
     return SeenTexels(TexelPixels(np.array([0]), np.array([0]), colours), np.ones(1), normal[None], colours)
 
 
-def test_irradiance_of_light_from_above_by_hand() -> None:
-    np.testing.assert_allclose(ABOVE.irradiance(np.stack([UP, SIDE, DOWN])), [1, 0.6, 0.2], atol=1e-12)
-
-
 def test_albedo_is_recovered_from_any_illumination() -> None:
     """The same albedo, photographed in full light, half-light and shade, is recovered because each photograph has its
     own normal."""

@@ -11,9 +11,9 @@ from torch import Tensor
 from hnerf.asset.baking import CAVITY_BRIGHTNESS, baked_textures, photographed_frames
 from hnerf.asset.light import Light
 from hnerf.asset.srgb import to_linear, to_srgb
+from hnerf.asset.tangents import unit
 from hnerf.asset.texture import rasterise, unwrap
 from hnerf.body.descriptor import normals_of
-from hnerf.body.rig import pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.config import AssetSettings
 from hnerf.geometry.rays import cast, mesh_on_cpu
@@ -36,16 +36,13 @@ class Grey(StandInAvatar):
 def pictures() -> dict[int, np.ndarray]:
     """Return an image of the column in each frame."""
     body, camera, found = figure.bending_body(), figure.side_camera(), {}
-    x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-    for frame, theta, root in zip(body.frames, body.theta, body.root, strict=True):
-        vertices_m, faces = pose_vertices(body.rig, theta, root).double().numpy(), body.rig.faces.numpy()
-        rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(float))
-        hits = cast(mesh_on_cpu(vertices_m, faces), *rays)
-        normals = hits.interpolate(normals_of(vertices_m, faces), faces)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        light = np.zeros(x.size)
+    faces = body.rig.faces.numpy()
+    for frame, surface_m in zip(body.frames, body.vertices_m().double().numpy(), strict=True):
+        hits = cast(mesh_on_cpu(surface_m, faces), *camera.rays(camera.pixels_px.reshape(-1, 2)))
+        normals = unit(hits.interpolate(normals_of(surface_m, faces), faces))
+        light = np.zeros(len(hits.face))
         light[hits.face >= 0] = to_srgb(GREY * SUN.irradiance(normals))
-        picture = np.round(255 * light).astype(np.uint8).reshape(*x.shape, 1)
+        picture = np.round(255 * light).astype(np.uint8).reshape(camera.height_px, camera.width_px, 1)
         found[frame] = np.repeat(picture, 3, 2)
     return found
 
@@ -61,8 +58,7 @@ class Pictured(Capture):
 def test_the_albedo_of_a_uniform_column_is_uniform(pictures: dict[int, np.ndarray]) -> None:
     """The light is scaled so that E is 1 at the brightest point."""
     body = figure.bending_body()
-    still_m = np.zeros((len(body.frames), *body.rig.vertices_m.shape), np.float32)
-    surfaces_m = figure.posed_with_displacements(body, still_m).astype(float)
+    surfaces_m = body.vertices_m().double().numpy()
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
     texture, albedo = baked_textures(capture, Grey(body), body, surfaces_m, layout, SETTINGS, figure.no_cavities(body))
@@ -88,9 +84,7 @@ def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
     """The upper half of the column is marked as a cavity."""
     body = figure.bending_body()
     vertices_m, faces = body.rig.vertices_m.numpy(), body.rig.faces.numpy()
-    still_m = np.zeros((len(body.frames), *vertices_m.shape), np.float32)
-    surfaces_m = figure.posed_with_displacements(body, still_m).astype(float)
-    layout = unwrap(vertices_m, faces, 64)
+    surfaces_m, layout = body.vertices_m().double().numpy(), unwrap(vertices_m, faces, 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
     texels = rasterise(layout, 64)
     z_m = vertices_m[faces[texels.face.numpy()]][..., 2]

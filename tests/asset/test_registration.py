@@ -81,11 +81,6 @@ def test_intersecting_faces_are_pulled_apart() -> None:
     assert np.abs(apart_m - vertices_m).max() < 0.003
 
 
-def test_a_closed_box_has_no_crossing_faces() -> None:
-    box = trimesh.creation.box(extents=(1, 1, 1))
-    assert not crossing_faces(np.asarray(box.vertices), np.asarray(box.faces)).any()
-
-
 def test_a_body_with_an_unknown_mesh_has_no_hidden_vertices() -> None:
     body = base_mesh(column_rig())
     assert body.uvs is None and not body.hidden.any()

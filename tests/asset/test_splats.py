@@ -8,7 +8,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from scipy.spatial.transform import Rotation
 
 from hnerf.asset.figures import splat_figures
-from hnerf.asset.package import AssetInfo, write_splats
+from hnerf.asset.package import write_splats
 from hnerf.asset.pictures import looks_on_black, splats_on_black
 from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.skinning import Skin, skinned
@@ -19,10 +19,9 @@ from hnerf.asset.validation import data_defects, validate_package
 from hnerf.body.descriptor import normals_of
 from hnerf.errors import InvalidAsset
 from hnerf.geometry.mesh_queries import Surface
-from tests.asset.figure import side_camera
+from tests.asset.figure import INFO, side_camera
 
 COUNT = 500
-INFO = AssetInfo("column", "1", "", "")
 SPLATS = "/Avatar/Splats"
 
 

@@ -35,22 +35,17 @@ def test_a_tangent_is_at_right_angles_to_the_normal() -> None:
     np.testing.assert_allclose(found, np.tile([0.8, 0, -0.6, 1], (4, 1)), atol=1e-12)
 
 
-def test_tangents_average_faces_weighted_by_their_angles() -> None:
+@pytest.mark.parametrize(("second", "rising", "side"), [([[1, 0], [0, 1]], (1, 1), 1), ([[0, 1], [1, 0]], (-1, 1), -1)])
+def test_tangents_average_faces_weighted_by_their_angles(
+    second: list[list[float]], rising: tuple[float, float], side: float
+) -> None:
+    """At the origin, u rises along x in the first face, of 45 degrees. In the second, of 90 degrees, it rises along x +
+    y, or, mirrored, along y - x; as the greater angle, this one decides the mirroring."""
     points_m = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [-1, 1, 0]])
-    shared = UvLayout(np.array([[0.0, 0], [1, 0], [1, 1], [1, 0], [0, 1]]), np.array([[0, 1, 2], [0, 3, 4]]))
-    found = uv_tangents(points_m, UP, HALVES, shared)
-    # At the origin, u rises along x in the first face, of 45 degrees, and along x + y in the second, of 90 degrees.
-    expected = np.array([1, 0]) + 2 * np.array([1, 1]) / 2**0.5
-    np.testing.assert_allclose(found[0, :2], expected / np.linalg.norm(expected), atol=1e-12)
-
-
-def test_the_face_with_the_greater_angle_decides_the_mirroring() -> None:
-    points_m = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [-1, 1, 0]])
-    shared = UvLayout(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [1, 0]]), np.array([[0, 1, 2], [0, 3, 4]]))
-    # As above, but the second face, of 90 degrees, is mirrored: there u rises along y - x.
-    found = uv_tangents(points_m, UP, HALVES, shared)
-    expected = np.array([1, 0]) + 2 * np.array([-1, 1]) / 2**0.5
-    np.testing.assert_allclose(found[0], [*expected / np.linalg.norm(expected), 0, -1], atol=1e-12)
+    shared = UvLayout(np.array([[0.0, 0], [1, 0], [1, 1], *second]), np.array([[0, 1, 2], [0, 3, 4]]))
+    expected = np.array([1, 0]) + 2 * np.array(rising) / 2**0.5
+    found = uv_tangents(points_m, UP, HALVES, shared)[0]
+    np.testing.assert_allclose(found, [*expected / np.linalg.norm(expected), 0, side], atol=1e-12)
 
 
 def test_texture_coordinates_without_area_still_get_a_unit_tangent() -> None:

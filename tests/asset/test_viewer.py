@@ -15,14 +15,16 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hnerf.asset.compact_glb import read_glb
+from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.viewer import MAX_BYTES, _modules, recording, write_viewer
 from hnerf.capture.capture import Capture
+from hnerf.evaluation.pictures import cast_pixels
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.models import THREE_SHA256, has_model
 from tests.asset.browser import Page, browser, found_browser
 from tests.asset.figure import FRAMES, capture, side_camera
-from tests.asset.pages import with_joints_in_second_set, write_avatar
+from tests.asset.pages import with_joints_in_second_set
 
 NEEDS_THREE = pytest.mark.skipif(
     not all(map(has_model, THREE_SHA256)), reason="three.js is not installed; `hnerf models` fetches it"
@@ -49,7 +51,7 @@ def viewer(staged: StagedAvatar, photographed: Capture, tmp_path_factory: pytest
     glb, full = folder / "avatar.glb", staged.rigs["full"]
     fast = dataclasses.replace(full.motions["captured"], fps=30.0, codes=np.arange(4.0))
     full = dataclasses.replace(full, motions=full.motions | {"fast": fast})
-    write_avatar(glb, dataclasses.replace(staged, rigs={"full": full}))
+    write_glb(glb, staged, full)
     glb.write_bytes(with_joints_in_second_set(glb.read_bytes()))
     written = write_viewer(folder / "viewer.html", glb, photographed, staged.stage_from_world)
     assert written == "viewer.html"
@@ -353,10 +355,7 @@ def decoded(uri: str) -> np.ndarray:
 
 def outline(world_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the pixels where the side camera sees a surface, (480, 640) bool."""
-    camera = side_camera()
-    pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
-    origins, directions = camera.rays(pixels.reshape(-1, 2))
-    hits = Surface(trimesh.Trimesh(world_m, faces, process=False)).cast(origins, directions)
+    hits = cast_pixels(Surface(trimesh.Trimesh(world_m, faces, process=False)), side_camera())
     return (hits.face >= 0).reshape(480, 640)
 
 
