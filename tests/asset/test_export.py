@@ -4,14 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from pxr import Usd, UsdGeom
 from threadpoolctl import threadpool_info, threadpool_limits
 from torch import Tensor
 
 from hnerf.asset.export import _clothed_surface, _rest_meshes, export_asset
 from hnerf.asset.pictures import turntable_cameras
-from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.base_mesh import base_mesh
 from hnerf.body.rig import pose_vertices
 from hnerf.capture.masks import Masks
@@ -19,7 +17,7 @@ from hnerf.config import AssetSettings, overridden
 from hnerf.errors import InputError, InvalidAsset
 from hnerf.render.motion import Motion, select_poses
 from tests.asset.figure import bending_body, capture, column_rig
-from tests.asset.stand_in import CLOTHING_M, StandInAvatar
+from tests.asset.stand_in import StandInAvatar
 
 SMALL = AssetSettings(
     grid_cells=96, faces=2000, level_faces=(500,), texture_px=128, photograph_frames=0, normal_map_px=64, correctives=2
@@ -34,14 +32,6 @@ def small_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
     monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
     monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))
-
-
-def test_the_surface_is_the_body_plus_clothing_thickness() -> None:
-    body = bending_body()
-    surface = surface_in_pose(StandInAvatar(body), torch.zeros_like(body.theta[0]), torch.eye(4), SMALL.grid_cells)
-    lower_m, upper_m = surface.bounds
-    assert lower_m == pytest.approx([-0.15 - CLOTHING_M, -0.15 - CLOTHING_M, -CLOTHING_M], abs=0.002)
-    assert upper_m == pytest.approx([0.15 + CLOTHING_M, 0.15 + CLOTHING_M, 1.6 + CLOTHING_M], abs=0.002)
 
 
 class Swelling(StandInAvatar):
