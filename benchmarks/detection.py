@@ -98,10 +98,9 @@ def score_residuals(folder: Path, capture: Capture) -> dict[str, Any]:
     """Return the residuals of keypoints triangulated with the given cameras."""
     keypoints = limb_keypoints(capture)
     cameras = [capture.cameras[name] for name in capture.train_cameras]
-    projections = np.stack([camera.projection for camera in cameras])
-    _, residuals_px, _ = triangulate(projections, keypoints.reshape(len(cameras), -1, 3))
+    _, residuals_px, _ = triangulate(cameras, keypoints)
     recorded = [capture.recorded_sizes_px[camera.name][1] / camera.height_px for camera in cameras]
-    return _percentiles(residuals_px * np.array(recorded)[:, None], keypoints)
+    return _percentiles(residuals_px * np.array(recorded)[:, None, None], keypoints)
 
 
 def score_truth(folder: Path, capture: Capture) -> dict[str, Any]:

@@ -32,11 +32,7 @@ def observe(capture: Capture) -> Observations:
     """Return the keypoints of every frame, from training cameras only. Raises InputError if the capture has none."""
     keypoints = ranked_people(capture)[0].keypoints
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
-    count, frames = keypoints.shape[:2]
-    space_m = np.full((frames, 25, 3), np.nan)
-    if count > 1:
-        projections = np.stack([camera.projection for camera in cameras])
-        space_m = triangulate(projections, keypoints.reshape(count, -1, 3))[0].reshape(frames, 25, 3)
+    space_m, _, _ = triangulate(cameras, keypoints)
     pixels, confidence = torch.from_numpy(keypoints).split([2, 1], -1)
     return Observations(cameras, pixels, confidence[..., 0], torch.from_numpy(space_m))
 

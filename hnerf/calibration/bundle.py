@@ -37,9 +37,8 @@ def adjust(
     reference_keypoints[~reference, :, 2] = 0
     adjusted = list(cameras)
     for _ in range(ROUNDS):
-        projections = np.stack([camera.projection for camera in adjusted])
-        points_m, _, inliers = triangulate(projections, reference_keypoints)
-        residuals_px = reprojection_px(projections, points_m, flat)
+        points_m, _, inliers = triangulate(adjusted, reference_keypoints)
+        residuals_px = reprojection_px(np.stack([camera.projection for camera in adjusted]), points_m, flat)
         used = inliers | (~reference[:, None] & (flat[..., 2] > 0) & np.isfinite(residuals_px))
         if used.sum() < MIN_OBSERVATIONS:
             break
@@ -109,8 +108,7 @@ def adjust_shared_lens(
     shared = np.array([camera.name in unknown for camera in cameras])
     adjusted, k1 = list(cameras), 0.0
     for _ in range(ROUNDS):
-        projections = np.stack([camera.projection for camera in adjusted])
-        points_m, residuals_px, used = triangulate(projections, undistort(flat, adjusted, unknown, k1))
+        points_m, residuals_px, used = triangulate(adjusted, undistort(flat, adjusted, unknown, k1))
         if used.sum() < MIN_OBSERVATIONS:
             break
         scale_px = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))

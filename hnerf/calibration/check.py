@@ -60,7 +60,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     settings = settings.model_copy(update={"max_residual_px": max(settings.max_residual_px, limit_px)})
     before = measure(given, keypoints)
     _check_convention(capture, given, keypoints, before)
-    cameras, mistakes = undo_mistake(given, keypoints)
+    cameras, mistakes = undo_mistake(given, keypoints, before)
     _check_height(capture, measure(cameras, keypoints) if mistakes else before)
     synchronised, held_out_px, notes = synchronise_capture(capture, cameras, keypoints, settings)
     keypoints = keypoints if synchronised is capture else ranked_people(synchronised)[0].keypoints

@@ -66,18 +66,16 @@ class Measure:
 
 def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
     """Measure the residuals of keypoints (C, frames, 25, 3) under at least two cameras."""
-    flat = keypoints.reshape(len(cameras), -1, 3)
-    points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
-    judged = (flat[..., 2] > 0) & np.isfinite(points_m).all(1)
-    points_m = points_m.reshape(*keypoints.shape[1:3], 3)
+    points_m, residuals_px, _ = triangulate(cameras, keypoints)
+    judged = (keypoints[..., 2] > 0) & np.isfinite(points_m).all(-1)
     off_px = max(float(np.hypot(*camera.size_px)) for camera in cameras)  # of a point behind a camera that sees it
     off = np.where(np.isfinite(residuals_px), residuals_px, off_px)
     found = {camera.name: row[use] for camera, row, use in zip(cameras, off, judged, strict=True)}
     return Measure(
         median_px={name: float(np.median(row)) if len(row) else off_px for name, row in found.items()},
         p95_px={name: float(np.percentile(row, 95)) if len(row) else off_px for name, row in found.items()},
-        cost_px=trimmed_cost_px(cameras, flat),
-        cost_without_px=cost_without_each_px(cameras, flat) if len(cameras) > 2 else {},
+        cost_px=trimmed_cost_px(cameras, keypoints),
+        cost_without_px=cost_without_each_px(cameras, keypoints) if len(cameras) > 2 else {},
         body_height_m=body_height_m(crossed_points(cameras, keypoints, points_m)),
         points_m=points_m,
     )
@@ -97,12 +95,13 @@ def crossed_points(cameras: Sequence[Camera], keypoints: np.ndarray, points_m: n
 
 def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
     """Return the mean over cameras of the trimmed mean (lowest four fifths) of the reprojection errors of keypoints (C,
-    K, 3).
+    ..., 3).
 
     Points are triangulated from all views: no view is rejected and no camera is trimmed away as a whole, so that none
     can hide. A point behind a camera that sees it costs the diagonal of that camera's image.
     """
     projections = np.stack([camera.projection for camera in cameras])
+    keypoints = keypoints.reshape(len(cameras), -1, 3)
     seen = keypoints[..., 2] > 0
     points_m = solve_points(projections, keypoints, confidence_of(keypoints))
     diagonal_px = np.array([[np.hypot(*c.size_px)] for c in cameras])
@@ -175,9 +174,9 @@ def median_height_px(keypoints: np.ndarray) -> float:
 def convention_mistake(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:
     """Return the convention mistakes that, undone in all cameras, make the calibration fit keypoints (C, frames, 25,
     3), joined by "or" where the views cannot tell them apart; None if none does."""
-    flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
+    limit_px = gross_limit_px(keypoints)
     explaining = [
-        cause for cause, undo in MISTAKES.items() if trimmed_cost_px([undo(c) for c in cameras], flat) <= limit_px
+        cause for cause, undo in MISTAKES.items() if trimmed_cost_px([undo(c) for c in cameras], keypoints) <= limit_px
     ]
     return " or ".join(explaining) or None
 
@@ -189,41 +188,33 @@ def size_ratio(cameras: Sequence[Camera], keypoints: np.ndarray) -> float | None
     None if the factor is close to 1, if none fits, or if a single camera may be the cause: with three or more cameras,
     if the others agree without it; with two, always.
     """
-    flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
-    if len(cameras) < 3 or min(cost_without_each_px(cameras, flat).values()) <= limit_px:
+    limit_px = gross_limit_px(keypoints)
+    if len(cameras) < 3 or min(cost_without_each_px(cameras, keypoints).values()) <= limit_px:
         return None
     scaled = ([dataclasses.replace(c, K=resampling(ratio, ratio) @ c.K) for c in cameras] for ratio in SIZE_RATIOS)
-    costs_px = [trimmed_cost_px(resized, flat) for resized in scaled]
+    costs_px = [trimmed_cost_px(resized, keypoints) for resized in scaled]
     best = int(np.argmin(costs_px))
     ratio = float(SIZE_RATIOS[best])
     return ratio if costs_px[best] <= limit_px and max(ratio, 1 / ratio) > OTHER_SIZE else None
 
 
-def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Camera], dict[str, str]]:
+def undo_mistake(cameras: list[Camera], keypoints: np.ndarray, found: Measure) -> tuple[list[Camera], dict[str, str]]:
     """Return the cameras with one camera's mistake undone, and that mistake by the camera's name, if that alone makes a
-    grossly wrong camera fit keypoints (C, frames, 25, 3). Mistakes with the same effect are joined by "or"."""
-    flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
-    gross = np.flatnonzero(_medians_px(cameras, flat) > limit_px)
-    if len(cameras) < 3 or len(gross) == 0:
+    grossly wrong camera fit keypoints (C, frames, 25, 3). Mistakes with the same effect are joined by "or". found: the
+    result of `measure` for both."""
+    limit_px = gross_limit_px(keypoints)
+    gross = [i for i, median_px in enumerate(found.median_px.values()) if median_px > limit_px]
+    if len(cameras) < 3 or not gross:
         return cameras, {}
     undone = {
         (i, cause): [*cameras[:i], undo(cameras[i]), *cameras[i + 1 :]]
         for i in gross
         for cause, undo in (MISTAKES | SINGLE_CAMERA_MISTAKES).items()
     }
-    medians_px = {what: _medians_px(repaired, flat) for what, repaired in undone.items()}
-    costs_px = {what: medians.sum() for what, medians in medians_px.items() if medians.max() <= limit_px}
+    medians_px = {what: [*measure(repaired, keypoints).median_px.values()] for what, repaired in undone.items()}
+    costs_px = {what: np.sum(medians) for what, medians in medians_px.items() if max(medians) <= limit_px}
     if not costs_px:
         return cameras, {}
     best = min(costs_px, key=costs_px.__getitem__)
     causes = [cause for (i, cause), cost in costs_px.items() if i == best[0] and np.isclose(cost, costs_px[best])]
     return undone[best], {cameras[best[0]].name: " or ".join(causes)}
-
-
-def _medians_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> np.ndarray:
-    """Return the median residual (C,) of each camera against robustly triangulated keypoints (C, K, 3); points behind a
-    camera count as infinitely far."""
-    points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), keypoints)
-    judged = (keypoints[..., 2] > 0) & np.isfinite(points_m).all(1)
-    off_px = np.where(np.isfinite(residuals_px), residuals_px, np.inf)
-    return np.array([np.median(row[use]) if use.any() else np.inf for row, use in zip(off_px, judged, strict=True)])

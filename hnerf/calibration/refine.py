@@ -202,5 +202,5 @@ def held_out_cost_px(
     costs = []
     for fitted, judged in held_out_parts(keypoints):
         adjusted = adjust(cameras, fitted, free, focal) if free else cameras
-        costs.append(trimmed_cost_px(adjusted, judged.reshape(len(cameras), -1, 3)))
+        costs.append(trimmed_cost_px(adjusted, judged))
     return float(np.mean(costs))

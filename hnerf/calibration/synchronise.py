@@ -226,7 +226,7 @@ def _halves_cost_px(cameras: Sequence[Camera], keypoints: Sequence[np.ndarray]) 
     """Return the mean of two trimmed costs: of the first keypoints (C, frames, 25, 3) on the first half of the frames,
     and of the second on the second half."""
     halves = [np.array_split(k, 2, axis=1)[half] for half, k in enumerate(keypoints)]
-    return float(np.mean([trimmed_cost_px(cameras, half.reshape(len(cameras), -1, 3)) for half in halves]))
+    return float(np.mean([trimmed_cost_px(cameras, half) for half in halves]))
 
 
 def _timing(view: _View) -> Timing:
@@ -267,8 +267,7 @@ def _jackknife_error(values: Sequence[float]) -> float:
 
 def _view(cameras: Sequence[Camera], keypoints: np.ndarray, index: int, frames: Sequence[int]) -> _View:
     others = [i for i in range(len(cameras)) if i != index]
-    projections = np.stack([cameras[i].projection for i in others])
-    points_m = triangulate(projections, keypoints[others].reshape(len(others), -1, 3))[0]
+    points_m = triangulate([cameras[i] for i in others], keypoints[others])[0].reshape(-1, 3)
     predicted_px, depth_m = cameras[index].project(points_m)
     predicted_px[~(depth_m > 0)] = np.nan
     pose_jacobian = np.nan_to_num(_pose_jacobian(cameras[index], points_m))

@@ -94,9 +94,8 @@ def _distance(capture: Capture, point: SubjectPoint, person: PersonTrack) -> flo
                 f"{capture.name}: capture.toml: subject: one camera tells no places on the ground; name a point in its "
                 "image"
             )
-        middle = person.keypoints[:, :, MIDDLE].reshape(len(cameras), -1, 3)
-        points_m = triangulate(np.stack([camera.projection for camera in cameras]), middle)[0]
-        ground = points_m[:, ["xyz".index(axis) for axis in "xyz" if axis != capture.up]]
+        points_m, _, _ = triangulate(cameras, person.keypoints[:, :, MIDDLE])
+        ground = points_m[..., ["xyz".index(axis) for axis in "xyz" if axis != capture.up]]
         known = ground[np.isfinite(ground).all(-1)]
         return float(np.linalg.norm(np.median(known, axis=0) - point.at)) if len(known) else np.inf
     if point.camera not in capture.train_cameras:

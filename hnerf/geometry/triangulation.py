@@ -1,9 +1,12 @@
 """Robust triangulation of points seen by several cameras, and reprojection errors."""
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+from hnerf.geometry.camera import Camera
 
 CHUNK = 1 << 14  # points triangulated at once, to bound memory
 MIN_INLIER_PX = 3.0
@@ -11,8 +14,8 @@ DAMPING = 1e-12  # share of the normal equations' trace: keeps them solvable for
 
 
 def triangulate(
-    projections: Float[np.ndarray, "C 3 4"], keypoints: Float[np.ndarray, "C K 3"]
-) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "C K"], Bool[np.ndarray, "C K"]]:
+    cameras: Sequence[Camera], keypoints: Float[np.ndarray, "C *S 3"]
+) -> tuple[Float[np.ndarray, "*S 3"], Float[np.ndarray, "C ..."], Bool[np.ndarray, "C ..."]]:
     """Triangulate points from several views, excluding outlier views.
 
     keypoints: x_px, y_px, confidence (0: unseen). For each point, every pair of views is solved linearly; the solution
@@ -23,7 +26,8 @@ def triangulate(
     Returns points_m (NaN with fewer than two inlier views), residuals_px (NaN where unseen or without a point) and
     inliers.
     """
-    confidence = confidence_of(keypoints)
+    shape, keypoints = keypoints.shape[:-1], keypoints.reshape(len(cameras), -1, 3)
+    projections, confidence = np.stack([camera.projection for camera in cameras]), confidence_of(keypoints)
     best = [_best_pair(projections, keypoints[:, i : i + CHUNK], confidence[:, i : i + CHUNK])
             for i in range(0, keypoints.shape[1], CHUNK)]  # fmt: skip
     pair_points = np.concatenate([points for points, _ in best]) if best else np.zeros((0, 3))
@@ -38,7 +42,8 @@ def triangulate(
     points_m[inliers.sum(0) < 2] = np.nan
     residuals_px[:, inliers.sum(0) < 2] = np.nan
     residuals_px[confidence == 0] = np.nan
-    return points_m, residuals_px, inliers & np.isfinite(residuals_px)
+    inliers &= np.isfinite(residuals_px)
+    return points_m.reshape(*shape[1:], 3), residuals_px.reshape(shape), inliers.reshape(shape)
 
 
 def confidence_of(keypoints: Float[np.ndarray, "*S 3"]) -> Float[np.ndarray, "*S"]:

@@ -173,9 +173,8 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     if len(cameras) == 1:
         return seen
-    flat = np.stack([found[camera.name].reshape(-1, 3) for camera in cameras])
-    points_m, _, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
-    poses_m = _interpolated(points_m.reshape(-1, 25, 3), capture.frames)
+    points_m, _, _ = triangulate(cameras, np.stack([found[camera.name] for camera in cameras]))
+    poses_m = _interpolated(points_m, capture.frames)
     return {camera.name: _in_image(camera, poses_m, seen[camera.name]) for camera in cameras}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.diagnosis import MISTAKES, SINGLE_CAMERA_MISTAKES, undo_mistake
+from hnerf.calibration.diagnosis import MISTAKES, SINGLE_CAMERA_MISTAKES, measure, undo_mistake
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.refine import Refinement, judge_by_outlines, refine
 from hnerf.calibration.silhouettes import Outlines
@@ -139,14 +139,15 @@ def test_a_known_mistake_in_one_camera_is_undone(cause: str) -> None:
         "T is in inches": lambda c: dataclasses.replace(c, t_m=c.t_m / 0.0254),
         "T is in metres declared as millimetres": lambda c: dataclasses.replace(c, t_m=1e-3 * c.t_m),
     }
-    cameras, causes = undo_mistake(with_c2(make[cause]), keypoints_of())
+    given, keypoints = with_c2(make[cause]), keypoints_of()
+    cameras, causes = undo_mistake(given, keypoints, measure(given, keypoints))
     assert causes == {"c2": cause}
     np.testing.assert_allclose(cameras[2].projection, ring(4)[2].projection, atol=1e-9)
 
 
 def test_a_camera_far_off_for_no_known_reason_is_left_to_refinement() -> None:
-    given = with_c2(lambda c: turned(c, 20.0))
-    assert undo_mistake(given, keypoints_of()) == (given, {})
+    given, keypoints = with_c2(lambda c: turned(c, 20.0)), keypoints_of()
+    assert undo_mistake(given, keypoints, measure(given, keypoints)) == (given, {})
 
 
 @pytest.mark.usefixtures("no_pictures")

@@ -12,7 +12,7 @@ def test_two_cameras_by_hand() -> None:
     a = Camera("a", K, np.eye(3), np.zeros(3), 100, 100)
     b = Camera("b", K, np.eye(3), np.array([-1.0, 0, 0]), 100, 100)
     keypoints = np.array([[[75, 60, 0.9]], [[25, 60, 0.9]]])
-    points_m, residuals_px, inliers = triangulate(np.stack([a.projection, b.projection]), keypoints)
+    points_m, residuals_px, inliers = triangulate([a, b], keypoints)
     np.testing.assert_allclose(points_m, [[0.5, 0.2, 2]], atol=1e-9)
     np.testing.assert_allclose(residuals_px, 0, atol=1e-7)
     assert inliers.all()
@@ -21,9 +21,9 @@ def test_two_cameras_by_hand() -> None:
 def test_residual_by_hand() -> None:
     # Rows that disagree by 2 px cannot meet in 3-D: with equal confidence each view misses by 1 px, vertically.
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
-    projections = np.stack([K @ np.hstack([np.eye(3), [[-x], [0], [0]]]) for x in (0.0, 1.0)])
+    cameras = [Camera("", K, np.eye(3), np.array([-x, 0, 0]), 100, 100) for x in (0.0, 1.0)]
     keypoints = np.array([[[75, 59, 0.9]], [[25, 61, 0.9]]])
-    points_m, residuals_px, _ = triangulate(projections, keypoints)
+    points_m, residuals_px, _ = triangulate(cameras, keypoints)
     np.testing.assert_allclose(residuals_px, 1, atol=1e-3)
     np.testing.assert_allclose(points_m[0], [0.5, 0.2, 2], atol=4e-3)
 
@@ -56,7 +56,7 @@ def test_an_outlier_view_is_left_out_and_its_residual_reported() -> None:
     cameras = ring(4)
     keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=0).values()])
     keypoints[2, 0, :2] += [30, 40]
-    points_m, residuals_px, inliers = triangulate(np.stack([c.projection for c in cameras]), keypoints)
+    points_m, residuals_px, inliers = triangulate(cameras, keypoints)
     np.testing.assert_allclose(points_m[0], walk_m()[0, 0], atol=1e-6)
     np.testing.assert_allclose(residuals_px[:, 0], [0, 0, 50, 0], atol=1e-3)
     assert inliers[:, 0].tolist() == [True, True, False, True]
@@ -67,7 +67,7 @@ def test_unseen_points_are_nan() -> None:
     keypoints = np.stack([np.append(c.project(np.zeros((2, 3)))[0], [[0.8], [0.8]], 1) for c in cameras])
     keypoints[1:, 0, 2] = 0  # the first point in one view only
     keypoints[0, 1, 2] = 0  # the second in two
-    points_m, residuals_px, _ = triangulate(np.stack([c.projection for c in cameras]), keypoints)
+    points_m, residuals_px, _ = triangulate(cameras, keypoints)
     assert np.isnan(points_m[0]).all()
     assert np.isnan(residuals_px[:, 0]).all()
     np.testing.assert_allclose(points_m[1], 0, atol=1e-6)
@@ -78,5 +78,5 @@ def test_noise_averages_out() -> None:
     # 2 px at 3.5 m and 1000 px focal length is 7 mm across a ray; four views bring the error under 10 mm.
     cameras = ring(4)
     keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=2).values()])
-    points_m, _, _ = triangulate(np.stack([c.projection for c in cameras]), keypoints)
+    points_m, _, _ = triangulate(cameras, keypoints)
     assert np.median(np.linalg.norm(points_m - walk_m().reshape(-1, 3), axis=1)) < 0.010

@@ -61,5 +61,5 @@ def _held_out_px(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence
     for fitted, judged in held_out_parts(keypoints):
         found, k1 = fit(cameras, fitted)
         straight = undistort(judged, found, unknown, k1)
-        costs_px.append(trimmed_cost_px(found, straight.reshape(len(cameras), -1, 3)))
+        costs_px.append(trimmed_cost_px(found, straight))
     return float(np.mean(costs_px))

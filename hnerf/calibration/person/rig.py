@@ -71,7 +71,7 @@ def first_poses(cameras: Sequence[Camera], keypoints: np.ndarray) -> list[Camera
             except InputError as error:
                 failures.append(error)
         if rigs:
-            return min(rigs, key=lambda rig: trimmed_cost_px(rig, seen.reshape(len(rig), -1, 3)))
+            return min(rigs, key=lambda rig: trimmed_cost_px(rig, seen))
     raise failures[0]
 
 
@@ -116,8 +116,7 @@ def _colmap(camera: Camera) -> pycolmap.Camera:
 def _angle_deg(cameras: tuple[Camera, Camera], keypoints: np.ndarray) -> float:
     """Return the median angle in degrees between the lines from points to two cameras. Lines have no direction, so that
     cameras that face each other count as if they were side by side."""
-    projections = np.stack([camera.projection for camera in cameras])
-    points_m = triangulate(projections, keypoints.reshape(2, -1, 3))[0]
+    points_m, _, _ = triangulate(cameras, keypoints)
     rays = np.stack([points_m - camera.centre_m for camera in cameras])
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True))[:, np.isfinite(points_m).all(-1)]
     cosines = np.abs((rays[0] * rays[1]).sum(-1)).clip(0, 1)
@@ -135,12 +134,9 @@ def _add_cameras(
         rig = dict(zip(known, adjusted, strict=True))
         if len(rig) == len(cameras):
             return [rig[i] for i in known]
-        projections = np.stack([rig[i].projection for i in known])
-        points_m = triangulate(projections, keypoints[known].reshape(len(known), -1, 3))[0]
+        points_m, _, _ = triangulate(adjusted, keypoints[known])
         tried = {
-            i: _resection(camera, points_m, keypoints[i].reshape(-1, 3), inlier_px)
-            for i, camera in enumerate(cameras)
-            if i not in rig
+            i: _resection(camera, points_m, keypoints[i], inlier_px) for i, camera in enumerate(cameras) if i not in rig
         }
         best = max(tried, key=lambda i: tried[i][1])
         if tried[best][1] < MIN_SHARED // 2:
@@ -152,9 +148,9 @@ def _add_cameras(
 
 
 def _resection(camera: Camera, points_m: np.ndarray, keypoints: np.ndarray, inlier_px: float) -> tuple[Camera, int]:
-    """Return the camera posed against known points (K, 3) that it sees at keypoints (K, 3), and how many fit (SQPnP,
-    Terzakis and Lourakis 2020, or, for a person so far away that it refuses, EPnP, in RANSAC)."""
-    use = (keypoints[:, 2] > 0) & np.isfinite(points_m).all(-1)
+    """Return the camera posed against known points (..., 3) that it sees at keypoints (..., 3), and how many fit
+    (SQPnP, Terzakis and Lourakis 2020, or, for a person so far away that it refuses, EPnP, in RANSAC)."""
+    use = (keypoints[..., 2] > 0) & np.isfinite(points_m).all(-1)
     if use.sum() < MIN_SHARED // 2:
         return camera, 0
 
