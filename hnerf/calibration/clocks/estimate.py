@@ -22,11 +22,10 @@ log = logging.getLogger("hnerf.calibration")
 
 class Clocks(NamedTuple):
     """Clocks by camera, the first camera's being the common one. error_s: standard error of each, in the middle of what
-    it recorded together with others; pairs: the measured ones; refused: why a pair could not be measured."""
+    it recorded together with others; refused: why a pair could not be measured."""
 
     clocks: dict[str, Clock]
     error_s: dict[str, float]
-    pairs: dict[tuple[str, str], PairClock]
     refused: dict[tuple[str, str], str]
 
 
@@ -69,7 +68,7 @@ def estimate_clocks(
         ratios,
     )
     clocks = {name: Clock(float(o), float(rate_of[name])) for name, o in zip(names, offsets_s, strict=True)}
-    return Clocks(clocks, dict(zip(names, map(float, errors_s), strict=True)), pairs, refused)
+    return Clocks(clocks, dict(zip(names, map(float, errors_s), strict=True)), refused)
 
 
 def _check_linked(

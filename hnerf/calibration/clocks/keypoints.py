@@ -38,15 +38,13 @@ class Track(NamedTuple):
 
 class PairClock(NamedTuple):
     """The clock of camera b as a function of camera a's: t_b = rate t_a + offset_s. middle_s: the middle of what both
-    recorded, on a's clock; error_s: standard error of t_b there; rate_error: of the rate, at most MAX_DRIFT_ERROR;
-    clear: the residual as a share of that of the next best offset."""
+    recorded, on a's clock; error_s: standard error of t_b there; rate_error: of the rate, at most MAX_DRIFT_ERROR."""
 
     offset_s: float
     rate: float
     middle_s: float
     error_s: float
     rate_error: float
-    clear: float
 
     def offset_at(self, rate: float) -> float:
         """Return the offset that synchronises both clocks in the middle of what both recorded if b's rate is `rate`,
@@ -147,8 +145,7 @@ def pair_clock(a: _Path, b: _Path, fundamental: np.ndarray | None = None, near_s
             "person in view of both, or leave one out"
         )
     others = [fit.residual for fit in fits if abs(fit.offset_s - best.offset_s) > OTHER_S]
-    clear = best.residual / min(others) if others else 0.0
-    if clear > CLEAR:
+    if others and best.residual > CLEAR * min(others):
         raise InputError(
             "no start offset is clearly better than all others, because the person moves too little, or walks evenly "
             "on; let the person wave, stop and turn in view of all cameras"
@@ -156,9 +153,9 @@ def pair_clock(a: _Path, b: _Path, fundamental: np.ndarray | None = None, near_s
     drifting = _refined(a, b, best.offset_s, f, drifts=True)
     error = np.sqrt(drifting.covariance.diagonal())
     if error[1] < MAX_DRIFT_ERROR and abs(drifting.rate - 1) > DRIFT_SIGMAS * error[1]:
-        return PairClock(*drifting[:3], float(error[0]), float(error[1]), clear)
+        return PairClock(*drifting[:3], float(error[0]), float(error[1]))
     rate_error = min(float(error[1]), MAX_DRIFT_ERROR)  # an unknown drift is not zero: other pairs may determine it
-    return PairClock(*best[:3], float(np.sqrt(best.covariance[0, 0])), rate_error, clear)
+    return PairClock(*best[:3], float(np.sqrt(best.covariance[0, 0])), rate_error)
 
 
 def _unit_fundamental(fundamental: np.ndarray, a: _Path, b: _Path) -> np.ndarray:
