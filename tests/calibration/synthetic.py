@@ -52,26 +52,27 @@ def walk_m(frames: int = FRAMES) -> np.ndarray:
     return np.stack(poses)
 
 
-def detections(cameras: list[Camera], noise_px: float, seed: int = 0) -> dict[str, np.ndarray]:
-    """Return, per camera, keypoints (frames, 1, 25, 3) of the walk with Gaussian noise and confidence 0.8."""
-    rng = np.random.default_rng(seed)
-    seen = {}
-    for camera in cameras:
-        uv = camera.project(walk_m())[0]
-        noisy = uv + rng.normal(size=uv.shape) * noise_px
-        seen[camera.name] = np.concatenate([noisy, np.full_like(uv[..., :1], 0.8)], -1)[:, None]
-    return seen
+def detections(cameras: list[Camera], noise_px: float, seed: int = 0) -> np.ndarray:
+    """Return keypoints (C, frames, 25, 3) of the walk with Gaussian noise and confidence 0.8."""
+    uv = np.stack([camera.project(walk_m())[0] for camera in cameras])
+    noisy = uv + np.random.default_rng(seed).normal(size=uv.shape) * noise_px
+    return np.concatenate([noisy, np.full_like(uv[..., :1], 0.8)], -1)
 
 
-def write_capture(root: Path, cameras: list[Camera], seen: dict[str, np.ndarray], up: str = "z") -> Capture:
-    """Write a capture with keypoints and no images, with the given cameras as its calibration."""
+def true_error_px(camera: Camera, truth: Camera) -> float:
+    """Return the median distance between both cameras' projections of the walk."""
+    return float(np.median(np.linalg.norm(camera.project(walk_m())[0] - truth.project(walk_m())[0], axis=-1)))
+
+
+def write_capture(root: Path, cameras: list[Camera], keypoints: np.ndarray) -> Capture:
+    """Write a capture without images, with the given cameras as its calibration and keypoints (C, frames, 25, 3) or, of
+    several people, (C, frames, P, 25, 3), of the first C cameras."""
     root.mkdir(parents=True, exist_ok=True)
-    np.savez(root / "keypoints.npz", **seen)  # type: ignore[arg-type]
-    sizes = {camera.name: (SIZE_PX, SIZE_PX) for camera in cameras}
-    frames = tuple(range(len(next(iter(seen.values())))))
-    names = tuple(camera.name for camera in cameras)
     by_name = {camera.name: camera for camera in cameras}
-    return Capture("ring", root, by_name, names, (), frames, (), 30.0, up, sizes, sizes)
+    people = keypoints if keypoints.ndim == 5 else keypoints[:, :, None]
+    np.savez(root / "keypoints.npz", **dict(zip(by_name, people, strict=False)))  # type: ignore[arg-type]
+    frames, sizes = tuple(range(keypoints.shape[1])), dict.fromkeys(by_name, (SIZE_PX, SIZE_PX))
+    return Capture("ring", root, by_name, tuple(by_name), (), frames, (), 30.0, "z", sizes, sizes)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
-from tests.calibration.synthetic import STANDING_M, detections, ring, turned, walk_m, write_capture
+from tests.calibration.synthetic import STANDING_M, detections, ring, true_error_px, turned, walk_m, write_capture
 
 SETTINGS = CalibrationSettings()
 SHIFT_PX = np.array([[0, 0, 20_000.0], [0, 0, 0], [0, 0, 0]])
@@ -39,11 +39,6 @@ def recorded_with(
     cameras = ring(count)
     wrong = [mistake(camera) if only in (None, i) else camera for i, camera in enumerate(cameras)]
     return write_capture(root, wrong, detections(cameras, noise_px))
-
-
-def true_error_px(camera: Camera, truth: Camera) -> float:
-    """Return the median distance between both cameras' projections of the walk."""
-    return float(np.median(np.linalg.norm(camera.project(walk_m())[0] - truth.project(walk_m())[0], axis=-1)))
 
 
 def test_body_height_by_hand() -> None:
@@ -111,7 +106,7 @@ def test_a_world_that_is_not_upright_is_doubted(tmp_path: Path) -> None:
 def test_keypoints_all_at_one_point_are_refused(tmp_path: Path) -> None:
     cameras = ring(4)
     seen = detections(cameras, 2)
-    seen["c1"][..., :2] = seen["c1"][:, :, :1, :2]
+    seen[1, ..., :2] = seen[1, :, :1, :2]
     with pytest.raises(InputError, match=r"camera c1: keypoints of a person lie within 0\.0 px; detect them again"):
         check_calibration(write_capture(tmp_path, cameras, seen), SETTINGS)
 
@@ -122,7 +117,7 @@ def test_runs_that_differ_in_the_last_digits_write_the_same_files(tmp_path: Path
     written = []
     for name, nudge_px in (("one", 0.0), ("two", 1e-9)):
         turned_camera = [turned(camera, 1.0) if i == 2 else camera for i, camera in enumerate(ring(3))]
-        seen = {c: points + np.array([nudge_px, -nudge_px, 0]) for c, points in detections(ring(3), 2).items()}
+        seen = detections(ring(3), 2) + np.array([nudge_px, -nudge_px, 0])
         capture = write_capture(tmp_path / name, turned_camera, seen)
         check_calibration(capture, SETTINGS).save(tmp_path / name / "out")
         files = ("report.json", "intri.yml", "extri.yml")
@@ -134,8 +129,7 @@ def test_without_legs_the_stored_height_is_null(tmp_path: Path) -> None:
     """JSON has no NaN; every reader accepts null."""
     cameras = ring(4)
     seen = detections(cameras, 2)
-    for points in seen.values():
-        points[..., [10, 11, 13, 14], :] = 0
+    seen[:, :, [10, 11, 13, 14]] = 0
     check_calibration(write_capture(tmp_path / "in", cameras, seen), SETTINGS).save(tmp_path / "out")
     stored = json.loads((tmp_path / "out" / "report.json").read_text(), parse_constant=pytest.fail)
     assert stored["body_height_m"] is None and stored["trimmed_cost_px"]["after"] > 0
@@ -145,7 +139,8 @@ def test_without_legs_the_stored_height_is_null(tmp_path: Path) -> None:
 def test_a_camera_with_bad_detections_is_suspect_or_rejected(tmp_path: Path, noise_px: float, status: str) -> None:
     """No calibration explains bad detections: a camera that is still usable is kept and marked, others are left out."""
     cameras = ring(4)
-    seen = detections(cameras, 2) | {"c2": detections(cameras, noise_px, seed=1)["c2"]}
+    seen = detections(cameras, 2)
+    seen[2] = detections(cameras, noise_px, seed=1)[2]
     capture = write_capture(tmp_path / "in", cameras, seen)
     report = check_calibration(capture, SETTINGS)
     assert report.verdict == report.verdicts["c2"].status == status
@@ -174,11 +169,9 @@ def test_cameras_with_any_name_are_read_back(tmp_path: Path) -> None:
 
 
 def test_leave_one_out_names_the_turned_camera() -> None:
-    cameras = ring(4)
-    keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=2).values()])
     for i in range(4):
-        off = [turned(camera, 1.0) if j == i else camera for j, camera in enumerate(cameras)]
-        costs = cost_without_each_px(off, keypoints)
+        off = [turned(camera, 1.0) if j == i else camera for j, camera in enumerate(ring(4))]
+        costs = cost_without_each_px(off, detections(ring(4), noise_px=2))
         assert min(costs, key=costs.__getitem__) == f"c{i}"
 
 
@@ -248,7 +241,7 @@ def test_intrinsics_for_another_image_size_are_named(tmp_path: Path, count: int,
 def test_a_camera_that_is_far_off_does_not_suggest_another_image_size(count: int) -> None:
     """With two cameras, scaling K by 0.74 would fit as well."""
     cameras = ring(count)
-    seen = np.stack([points[:, 0] for points in detections(cameras, 2).values()])
+    seen = detections(cameras, 2)
     assert size_ratio([turned(cameras[0], 20), *cameras[1:]], seen) is None
     assert size_ratio(cameras, seen) is None
 
@@ -258,7 +251,7 @@ def test_images_of_another_size_are_scaled_about_their_corner() -> None:
     of the first pixel instead, keypoints would be off by (5 - 1) / 2 = 2 px."""
     cameras = [camera.resized(14, 14) for camera in ring(3)]
     seen = detections([camera.resized(70, 70) for camera in cameras], 0)
-    assert size_ratio(cameras, np.stack([points[:2, 0] for points in seen.values()])) == pytest.approx(5)
+    assert size_ratio(cameras, seen[:, :2]) == pytest.approx(5)
 
 
 def test_a_wrong_convention_in_one_camera_is_named(tmp_path: Path) -> None:
@@ -315,7 +308,7 @@ def test_swapped_camera_files_are_explained_by_no_known_mistake(tmp_path: Path) 
 def test_a_camera_that_never_shows_the_person_is_left_out_if_two_others_do(tmp_path: Path) -> None:
     cameras = ring(4)
     seen = detections(cameras, noise_px=1)
-    seen["c2"] = 0 * seen["c2"]
+    seen[2] = 0
     capture = write_capture(tmp_path / "in", cameras, seen)
     report = check_calibration(capture, SETTINGS)
     assert [verdict.status for verdict in report.verdicts.values()] == ["ok", "ok", "rejected", "ok"]
@@ -352,7 +345,7 @@ def test_a_rendered_capture_is_left_unchanged(wave: Capture) -> None:
 def test_the_trimmed_cost_uses_every_view() -> None:
     """One camera looks backwards. Rejecting it would cost a quarter of its image's diagonal, 354 px, and no more."""
     cameras = ring(4)
-    keypoints = np.stack([found[:, 0] for found in detections(cameras, 0).values()]).reshape(4, -1, 3)
+    keypoints = detections(cameras, 0)
     assert trimmed_cost_px(cameras, keypoints) == pytest.approx(0, abs=1e-6)
     backwards = [turned(cameras[0], 180.0), *cameras[1:]]
     assert trimmed_cost_px(backwards, keypoints) > 400
@@ -362,6 +355,5 @@ def test_trimming_the_cost_does_not_drop_a_whole_camera(monkeypatch: pytest.Monk
     """Five cameras are 1 to 10 px off, with a mean of 4.5 px over the lowest eight errors, and one is 100 px off:
     (5 x 4.5 + 100) / 6. The lowest four fifths of all 60 errors together would leave that camera out."""
     cameras, off_px = ring(6), np.stack([*[np.arange(1.0, 11)] * 5, np.full(10, 100.0)])
-    keypoints = np.stack([found[:2, 0, :5].reshape(10, 3) for found in detections(cameras, 0).values()])
     monkeypatch.setattr("hnerf.calibration.diagnosis.reprojection_px", lambda *_: off_px)
-    assert trimmed_cost_px(cameras, keypoints) == pytest.approx((5 * 4.5 + 100) / 6)
+    assert trimmed_cost_px(cameras, detections(cameras, 0)[:, :2, :5]) == pytest.approx((5 * 4.5 + 100) / 6)

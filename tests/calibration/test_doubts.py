@@ -43,8 +43,7 @@ def test_two_cameras_facing_each_other_cannot_detect_exchanged_sides(tmp_path: P
     reveals the exchange."""
     centres_m = ([50.0, 0, 0.9], [-50.0, 0, 0.9], [0, 50.0, 0.9])
     cameras = [dataclasses.replace(c, t_m=-c.R @ np.array(m)) for c, m in zip(ring(3), centres_m, strict=True)]
-    seen = detections(cameras, 1)
-    capture = write_capture(tmp_path, cameras, seen)
+    capture = write_capture(tmp_path, cameras, detections(cameras, 1))
     keypoints = np.ones((3, FRAMES, 25, 3))
     (doubt,) = doubts(capture, keypoints, exchanged(walk_m()))
     assert doubt.startswith("left and right are exchanged")
@@ -57,13 +56,13 @@ def with_masks(root: Path) -> tuple[Capture, np.ndarray]:
     cameras = ring(3)
     seen = detections(cameras, 1)
     capture = write_capture(root, cameras, seen)
-    for name, people in seen.items():
-        for frame, (person,) in enumerate(people):
+    for camera, people in zip(cameras, seen, strict=True):
+        for frame, person in enumerate(people):
             mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
             for x, y in person[:, :2].round().astype(int).clip(20, SIZE_PX - 20):
                 mask[y - 20 : y + 21, x - 20 : x + 21] = 255
-            write_image(root / "masks" / name / f"{frame:06d}.png", mask)
-    return dataclasses.replace(capture, root=root), np.stack([people[:, 0] for people in seen.values()])
+            write_image(root / "masks" / camera.name / f"{frame:06d}.png", mask)
+    return capture, seen
 
 
 def test_masks_reveal_keypoints_of_mirrored_images(tmp_path: Path) -> None:
@@ -114,7 +113,7 @@ def test_masks_that_are_loose_or_show_half_the_person_raise_no_doubt(tmp_path: P
 
 def test_without_masks_or_plates_there_is_no_doubt(tmp_path: Path) -> None:
     capture = write_capture(tmp_path, ring(3), detections(ring(3), 1))
-    assert of_other_pictures(capture, np.stack([people[:, 0] for people in detections(ring(3), 1).values()])) == []
+    assert of_other_pictures(capture, detections(ring(3), 1)) == []
 
 
 def with_a_test_camera(root: Path, wrong: Camera, detected: bool) -> Capture:

@@ -14,7 +14,7 @@ from tests.shared_data import shared_capture
 
 def standing() -> np.ndarray:
     """Return the walk as the first camera of the ring sees it, without noise."""
-    return detections(ring(1), noise_px=0)["c0"][:, 0]
+    return detections(ring(1), noise_px=0)[0]
 
 
 def test_plausible_intrinsics_give_no_reasons() -> None:

@@ -10,8 +10,8 @@ from hnerf.calibration import outline_adjustment, silhouettes
 from hnerf.calibration.outline_adjustment import _turned, _zoomed_about, adjust_to_outlines, follow_outlines
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.geometry.camera import Camera
-from tests.calibration.synthetic import ring, turned
-from tests.calibration.test_refine import keypoints_of, refined, with_c2
+from tests.calibration.synthetic import detections, ring, turned
+from tests.calibration.test_refine import refined, with_c2
 from tests.calibration.test_silhouettes import CORNERS_M, mask
 
 MIDDLE_M = np.array([0.0, 0.0, 0.9])
@@ -81,12 +81,12 @@ def test_outlines_correct_keypoint_errors_that_are_the_same_in_all_frames(
     If keypoints have no error, outlines change nothing."""
     monkeypatch.setattr(Outlines, "of", lambda *_: outlines())
     given = with_c2(lambda c: turned(c, 1.0))
-    biased = keypoints_of()
+    biased = detections(ring(4), 1)
     biased[2, ..., 0] += 4
     alone, both = (refined(tmp_path / name, given, biased, o) for name, o in (("a", None), ("b", outlines())))
     assert off_px(alone.cameras)[2] == pytest.approx(4, abs=0.5) and off_px(both.cameras)[2] < 1
     assert "; then fitted to outlines: those of held-out frames go from" in both.reasons["c2"]
-    exact = refined(tmp_path / "c", given, keypoints_of(0), outlines())
+    exact = refined(tmp_path / "c", given, detections(ring(4), 0), outlines())
     assert "outlines" not in exact.reasons["c2"] and off_px(exact.cameras)[2] < 0.1
 
 

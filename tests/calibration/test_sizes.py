@@ -61,7 +61,7 @@ def test_black_bars_explain_a_change_of_size(narrow: Capture) -> None:
 
 def test_residuals_decide_on_a_size_change_only_without_bars_and_with_proof(narrow: Capture) -> None:
     cameras = ring(4)
-    keypoints = np.stack([seen[:, 0] for seen in detections(cameras, 1).values()])
+    keypoints = detections(cameras, 1)
     # The image was stretched: for it, the intrinsics of the wider image are 1.08 times too long horizontally.
     K = np.array([[1.08, 0, 0.04], [0, 1, 0], [0, 0, 1]]) @ cameras[1].K
     as_calibrated = [dataclasses.replace(c, K=K) if c.name == "c1" else c for c in cameras]

@@ -40,8 +40,7 @@ def recorded(offsets: dict[str, float], frames: int = FRAMES, noise_px: float = 
 
 
 def capture_of(root: Path, keypoints: np.ndarray, frames: tuple[int, ...] | None = None) -> Capture:
-    seen = {camera.name: k[:, None] for camera, k in zip(ring(4), keypoints, strict=True)}
-    capture = write_capture(root, ring(4), seen)
+    capture = write_capture(root, ring(4), keypoints)
     return capture if frames is None else dataclasses.replace(capture, train_frames=frames)
 
 

@@ -31,11 +31,11 @@ def recorded(root: Path, cameras: list[Camera], *people_m: np.ndarray) -> tuple[
     the detections of each person."""
     rng = np.random.default_rng(0)
     each = [{camera.name: seen_by(camera, joints_m, rng) for camera in cameras} for joints_m in people_m]
-    mixed = {}
+    mixed = []
     for camera in cameras:
         together = np.stack([one[camera.name] for one in each], 1)
-        mixed[camera.name] = np.stack([frame[rng.permutation(len(each))] for frame in together])
-    return write_capture(root, cameras, mixed), each
+        mixed.append([frame[rng.permutation(len(each))] for frame in together])
+    return write_capture(root, cameras, np.array(mixed)), each
 
 
 def walking(start_m: tuple[float, float], end_m: tuple[float, float]) -> np.ndarray:
@@ -147,7 +147,7 @@ def test_equally_likely_subjects_are_reported_in_recorded_pixels(tmp_path: Path)
     """The recorded image is 8 times as large: pixel 400 covers its pixels 3200 to 3207, whose middle is 3203.5."""
     x, y, seen = np.linspace(-20, 20, 25), np.linspace(-50, 50, 25), np.full(25, CONFIDENCE)
     moving = [np.stack([x + middle, y + 500 + 2 * f, seen], -1) for f in range(FRAMES) for middle in (400, 600)]
-    capture = write_capture(tmp_path, ring(1), {"c0": np.reshape(moving, (FRAMES, 2, 25, 3))})
+    capture = write_capture(tmp_path, ring(1), np.reshape(moving, (1, FRAMES, 2, 25, 3)))
     capture = dataclasses.replace(capture, recorded_sizes_px={"c0": (8000, 8000)})
     with pytest.raises(InputError, match=r"at \(4804, 4004\) and \(3204, 4004\) in camera c0, frame 0"):
         subject_keypoints(capture)
@@ -197,27 +197,27 @@ def test_a_bystander_is_not_taken_for_the_subject(
         uv = camera.project(walk_m()[0] + ([1.5, 0.5, 0] if surer_in else [-2.5, 1.6, 0]))[0]
         confidence = 0.95 * (i < surer_in) if surer_in else 0.8
         other = np.broadcast_to(np.concatenate([uv, np.full((25, 1), confidence)], 1), (12, 1, 25, 3))
-        subject = detections(rig, noise_px=1)[camera.name][order]
+        subject = detections(rig, noise_px=1)[i, order][:, None]
         if camera.name == "c0":
             subject[missed] = 0
         both[camera.name], expected[camera.name] = np.concatenate([subject, other], 1), subject[:, 0]
         both[camera.name][i::3] = both[camera.name][i::3, ::-1]
-    chosen = subject_keypoints(write_capture(tmp_path, rig, both))
+    chosen = subject_keypoints(write_capture(tmp_path, rig, np.stack([*both.values()])))
     for name, keypoints in expected.items():
         np.testing.assert_array_equal(chosen[name], keypoints)
 
 
 def test_one_camera_takes_the_largest_and_most_central_person(tmp_path: Path) -> None:
     camera = ring(4)[0]
-    subject = detections([camera], noise_px=1)["c0"]
+    subject = detections([camera], noise_px=1)
     small = subject * [0.4, 0.4, 1]  # towards the upper left corner, at the same confidence
-    chosen = subject_keypoints(write_capture(tmp_path, [camera], {"c0": np.concatenate([small, subject], 1)}))
-    np.testing.assert_array_equal(chosen["c0"], subject[:, 0])
+    chosen = subject_keypoints(write_capture(tmp_path, [camera], np.stack([small, subject], 2)))
+    np.testing.assert_array_equal(chosen["c0"], subject[0])
 
 
 def test_test_cameras_are_never_read(tmp_path: Path) -> None:
     cameras = ring(4)
-    capture = write_capture(tmp_path, cameras, {c: k for c, k in detections(cameras, 1).items() if c != "c3"})
+    capture = write_capture(tmp_path, cameras, detections(cameras[:3], 1))
     capture = dataclasses.replace(capture, train_cameras=("c0", "c1", "c2"), test_cameras=("c3",))
     assert set(subject_keypoints(capture)) == {"c0", "c1", "c2"}
 
@@ -225,7 +225,7 @@ def test_test_cameras_are_never_read(tmp_path: Path) -> None:
 def test_a_person_seen_by_only_one_of_several_cameras_is_refused(tmp_path: Path) -> None:
     cameras = ring(3)
     rng = np.random.default_rng(0)
-    seen = {c.name: seen_by(c, walk_m(), rng)[:, None] * (c.name == "c1") for c in cameras}
+    seen = np.stack([seen_by(c, walk_m(), rng) * (c.name == "c1") for c in cameras])
     with pytest.raises(InputError, match="no person found by any camera but c1"):
         subject_keypoints(write_capture(tmp_path, cameras, seen))
 
@@ -233,7 +233,7 @@ def test_a_person_seen_by_only_one_of_several_cameras_is_refused(tmp_path: Path)
 def test_a_nan_keypoint_counts_as_not_seen(tmp_path: Path) -> None:
     capture, (subject,) = recorded(tmp_path, ring(1), walk_m())
     subject["c0"][3, 7, 0] = np.nan
-    capture = write_capture(tmp_path, list(capture.cameras.values()), {"c0": subject["c0"][:, None]})
+    capture = write_capture(tmp_path, list(capture.cameras.values()), subject["c0"][None])
     found = subject_keypoints(capture)["c0"][3]
     assert found[7].tolist() == [0, 0, 0] and np.array_equal(found[8], subject["c0"][3, 8])
 

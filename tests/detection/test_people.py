@@ -30,7 +30,7 @@ def track(*images: np.ndarray, moves: bool = True) -> PersonTrack:
 def capture(tmp_path: Path) -> Capture:
     """Return a capture of one camera with 100 x 100 px and two grey frames."""
     camera = dataclasses.replace(ring(1)[0], width_px=SIZE_PX, height_px=SIZE_PX)
-    found = write_capture(tmp_path, [camera], {"c0": np.zeros((2, 1, 25, 3))})
+    found = write_capture(tmp_path, [camera], np.zeros((1, 2, 25, 3)))
     for frame in found.frames:
         write_image(tmp_path / "images" / "c0" / f"{frame:06d}.png", np.full((SIZE_PX, SIZE_PX, 3), 90, np.uint8))
     return found

@@ -54,12 +54,12 @@ def test_a_pair_of_more_confident_views_wins_over_one_in_larger_images() -> None
 
 def test_an_outlier_view_is_left_out_and_its_residual_reported() -> None:
     cameras = ring(4)
-    keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=0).values()])
-    keypoints[2, 0, :2] += [30, 40]
+    keypoints = detections(cameras, noise_px=0)
+    keypoints[2, 0, 0, :2] += [30, 40]
     points_m, residuals_px, inliers = triangulate(cameras, keypoints)
-    np.testing.assert_allclose(points_m[0], walk_m()[0, 0], atol=1e-6)
-    np.testing.assert_allclose(residuals_px[:, 0], [0, 0, 50, 0], atol=1e-3)
-    assert inliers[:, 0].tolist() == [True, True, False, True]
+    np.testing.assert_allclose(points_m[0], walk_m()[0], atol=1e-6)
+    np.testing.assert_allclose(residuals_px[:, 0, 0], [0, 0, 50, 0], atol=1e-3)
+    assert inliers[:, 0, 0].tolist() == [True, True, False, True]
 
 
 def test_unseen_points_are_nan() -> None:
@@ -77,6 +77,5 @@ def test_unseen_points_are_nan() -> None:
 def test_noise_averages_out() -> None:
     # 2 px at 3.5 m and 1000 px focal length is 7 mm across a ray; four views bring the error under 10 mm.
     cameras = ring(4)
-    keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=2).values()])
-    points_m, _, _ = triangulate(cameras, keypoints)
-    assert np.median(np.linalg.norm(points_m - walk_m().reshape(-1, 3), axis=1)) < 0.010
+    points_m, _, _ = triangulate(cameras, detections(cameras, noise_px=2))
+    assert np.median(np.linalg.norm(points_m - walk_m(), axis=-1)) < 0.010

@@ -25,7 +25,7 @@ def write_scene(
     middle = np.array([0, 0, 0.9])
     places = [np.array([3.5 * np.cos(a), 3.5 * np.sin(a), 1.0]) for a in 1.2 * np.arange(cameras)]
     views = [look_at(f"c{i}", place, middle).resized(SIZE_PX, SIZE_PX) for i, place in enumerate(places)]
-    seen, truth = {}, {}
+    seen, truth = [], {}
     for camera in views:
         room = cv2.resize(rng.integers(90, 200, (40, 40, 3)).astype(np.uint8), (SIZE_PX, SIZE_PX))
         poses_px = []
@@ -45,10 +45,10 @@ def write_scene(
             noisy = (image + rng.normal(size=image.shape) * 2).clip(0, 255).astype(np.uint8)
             write_image(root / "images" / camera.name / f"{frame:06d}.png", noisy)
             poses_px.append(np.concatenate([pose_px, np.full((25, 1), 0.8)], 1))
-        seen[camera.name] = np.stack(poses_px)[:, None]
+        seen.append(poses_px)
         if plate:
             write_image(root / "background" / f"{camera.name}.png", room)
-    return write_capture(root, views, seen), truth
+    return write_capture(root, views, np.array(seen)), truth
 
 
 def write_likely(capture: Capture, masks: dict) -> None:

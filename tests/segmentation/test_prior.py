@@ -78,7 +78,7 @@ def test_a_camera_that_looks_away_from_the_person_sees_nobody(tmp_path: Path) ->
     mask given there shows somebody else."""
     cameras = ring(3)
     seen = detections(cameras, 0.5)
-    seen["c2"][..., 2] = 0
+    seen[2, ..., 2] = 0
     away = turned(cameras[2], 180)
     capture = write_capture(tmp_path, [*cameras[:2], away], seen)
     found = _consistent_keypoints(capture, None)

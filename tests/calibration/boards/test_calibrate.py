@@ -151,7 +151,7 @@ def test_unlinked_cameras_are_refused() -> None:
 def test_board_evidence_lists_unlinked_cameras(tmp_path: Path) -> None:
     corners_px = seen(rig(), {})
     corners_px[2] = np.nan
-    capture = write_capture(tmp_path, rig(), {camera.name: np.zeros((2, 1, 25, 3)) for camera in rig()})
+    capture = write_capture(tmp_path, rig(), np.zeros((3, 2, 25, 3)))
     BoardCorners(("a", "b", "c"), BOARD.corners_m, corners_px, 1, tuple(range(FRAMES))).save(capture.root)
     found = board_evidence(capture)
     assert found is not None and found["unlinked_cameras"] == ["c"] and list(found["cameras"]) == ["a", "b"]
@@ -164,7 +164,7 @@ def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
     cameras = rig()
     stored = BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {}), 1, tuple(range(FRAMES)))
     bumped = [cameras[0], turned(cameras[1], 1.0), cameras[2]]
-    capture = write_capture(tmp_path / "bumped", bumped, {camera.name: np.zeros((2, 1, 25, 3)) for camera in cameras})
+    capture = write_capture(tmp_path / "bumped", bumped, np.zeros((3, 2, 25, 3)))
     assert board_evidence(capture) is None
     stored.save(capture.root)
     found = board_evidence(capture)
@@ -180,7 +180,7 @@ def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
 def test_board_evidence_allows_for_gaps_between_frames(tmp_path: Path) -> None:
     """In bursts of images that b takes LAG later, each camera still fits its own footage."""
     cameras, frames = rig(), tuple(first + i for first in (0, 20, 40, 60) for i in range(4))
-    capture = write_capture(tmp_path, cameras, {camera.name: np.zeros((2, 1, 25, 3)) for camera in cameras})
+    capture = write_capture(tmp_path, cameras, np.zeros((3, 2, 25, 3)))
     BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {"b": LAG}, frames), 1, frames).save(capture.root)
     found = board_evidence(capture)
     assert found is not None

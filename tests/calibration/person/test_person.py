@@ -39,13 +39,9 @@ def worst_errors(cameras: list[Camera], truth: list[Camera]) -> tuple[float, flo
     return float(np.rad2deg(max(turns))), float(max(moves))
 
 
-def seen_by(cameras: list[Camera], noise_px: float) -> np.ndarray:
-    return np.stack([found[:, 0] for found in detections(cameras, noise_px).values()])
-
-
 def test_a_rig_is_found_without_poses() -> None:
     truth = ring(4)
-    found = first_poses([without_pose(camera) for camera in truth], seen_by(truth, 0.5))
+    found = first_poses([without_pose(camera) for camera in truth], detections(truth, 0.5))
     turn_deg, move_m = worst_errors(found, truth)
     assert turn_deg < 0.1 and move_m < 0.01
 
@@ -55,7 +51,7 @@ def test_a_rig_of_cameras_far_from_the_person_is_found() -> None:
     middle_m, K = np.array([0, 0, 0.9]), np.array([[85e3, 0, 499.5], [0, 85e3, 499.5], [0, 0, 1]])
     places_m = [(camera.name, middle_m + 85 * (camera.centre_m - middle_m)) for camera in ring(4)]
     far = [dataclasses.replace(look_at(name, place_m, middle_m), K=K) for name, place_m in places_m]
-    found = first_poses([without_pose(camera) for camera in far], seen_by(far, 0.5))
+    found = first_poses([without_pose(camera) for camera in far], detections(far, 0.5))
     turn_deg, move_m = worst_errors(found, far)
     assert turn_deg < 0.1 and move_m < 0.01 * 300
 
@@ -65,7 +61,7 @@ def test_a_camera_that_sees_the_person_for_a_moment_is_added(monkeypatch: pytest
     that it takes."""
     monkeypatch.setattr(rig, "START_FRAMES", 3)
     truth = ring(4)
-    keypoints = seen_by(truth, 0.5)
+    keypoints = detections(truth, 0.5)
     keypoints[3, 4:, :, 2] = 0
     turn_deg, move_m = worst_errors(first_poses([without_pose(camera) for camera in truth], keypoints), truth)
     assert turn_deg < 0.3 and move_m < 0.03
@@ -83,13 +79,15 @@ def test_a_pair_with_a_wrong_pose_does_not_end_the_search(monkeypatch: pytest.Mo
         return rig._Pair((first, turned(second, 90, axis=1)), agreeing=10**6, angle_deg=60.0)
 
     monkeypatch.setattr(rig, "_relative_pose", misleading)
-    turn_deg, move_m = worst_errors(first_poses([without_pose(camera) for camera in truth], seen_by(truth, 0.5)), truth)
+    turn_deg, move_m = worst_errors(
+        first_poses([without_pose(camera) for camera in truth], detections(truth, 0.5)), truth
+    )
     assert turn_deg < 0.1 and move_m < 0.01
 
 
 def test_a_common_focal_length_is_found_from_a_poor_guess() -> None:
     truth = ring(4)
-    keypoints = seen_by(truth, 0.5)
+    keypoints = detections(truth, 0.5)
     K = np.array([[750.0, 0, 499.5], [0, 750, 499.5], [0, 0, 1]])
     guess = [dataclasses.replace(without_pose(camera), K=K) for camera in truth]
     fit, _ = fit_lenses(first_poses(guess, keypoints), keypoints, [c.name for c in truth], 0.02)
@@ -99,7 +97,7 @@ def test_a_common_focal_length_is_found_from_a_poor_guess() -> None:
 
 def test_a_distortion_is_found_if_held_out_keypoints_show_it() -> None:
     truth = ring(4)
-    keypoints = seen_by(truth, 0.3)
+    keypoints = detections(truth, 0.3)
     for points, camera in zip(keypoints, truth, strict=True):
         rays = (points[..., :2] - camera.K[:2, 2]) / 1000
         points[..., :2] = 1000 * rays * (1 - 0.2 * (rays**2).sum(-1, keepdims=True)) + camera.K[:2, 2]
@@ -225,7 +223,7 @@ def test_a_lens_is_given_for_images_of_the_recorded_size(tmp_path: Path) -> None
     assert lens.size_px == (2000, 2000) and lens.distortion.tolist() == [-0.1, 0, 0, 0]
 
 
-def refusal(tmp_path: Path, cameras: list[Camera], seen: dict[str, np.ndarray], unknown: list[str]) -> str:
+def refusal(tmp_path: Path, cameras: list[Camera], seen: np.ndarray, unknown: list[str]) -> str:
     capture = write_capture(tmp_path, [without_pose(camera) for camera in cameras], seen)
     with pytest.raises(InputError) as refused:
         calibrate_from_person(capture, unknown, dict.fromkeys(capture.cameras, ""), 1.8)
@@ -246,7 +244,7 @@ def test_joints_that_are_never_seen_do_not_count_as_still() -> None:
 
 
 def test_a_person_who_stands_still_is_refused(tmp_path: Path) -> None:
-    still = {name: np.repeat(found[:1], 12, axis=0) for name, found in detections(ring(4), 1.0).items()}
+    still = detections(ring(4), 1.0)[:, :1].repeat(12, axis=1)
     assert "stands still" in refusal(tmp_path, ring(4), still, [])
 
 
@@ -265,13 +263,13 @@ def test_cameras_in_one_line_cannot_find_the_focal_length(count: int, tmp_path: 
 
 def test_too_few_shared_keypoints_are_refused(tmp_path: Path) -> None:
     seen = detections(ring(3), 1.0)
-    seen["c2"][2:, ..., 2] = 0
+    seen[2, 2:, :, 2] = 0
     assert "camera c2 shares 50 keypoints" in refusal(tmp_path, ring(3), seen, [])
 
 
 def test_recordings_of_different_times_are_refused(tmp_path: Path) -> None:
     seen = detections(ring(4), 1.0)
-    seen["c1"] = seen["c1"][[5, 2, 9, 0, 11, 7, 1, 10, 4, 8, 3, 6]]
+    seen[1] = seen[1, [5, 2, 9, 0, 11, 7, 1, 10, 4, 8, 3, 6]]
     assert "camera c1" in refusal(tmp_path, ring(4), seen, [])
 
 
@@ -279,10 +277,10 @@ def test_each_camera_takes_the_named_person_or_the_best_candidate(tmp_path: Path
     """Two people walk side by side. The second is named in c0, and is a little larger in c1."""
     seen = detections(ring(2), 0.0)
     aside = np.array([200.0, 0, 0])
-    both = {name: np.concatenate([found - aside, found + aside], 1) for name, found in seen.items()}
-    middle = both["c1"][:, 1:, :, :2].mean(2, keepdims=True)
-    both["c1"][:, 1:, :, :2] = middle + 1.05 * (both["c1"][:, 1:, :, :2] - middle)
+    both = np.stack([seen - aside, seen + aside], 2)
+    middle = both[1, :, 1, :, :2].mean(1, keepdims=True)
+    both[1, :, 1, :, :2] = middle + 1.05 * (both[1, :, 1, :, :2] - middle)
     capture = write_capture(tmp_path, [without_pose(camera) for camera in ring(2)], both)
-    x, y, _ = both["c0"][3, 1, 0]
+    x, y, _ = both[0, 3, 1, 0]
     capture = dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c0", 3))
-    np.testing.assert_array_equal(_each_alone(capture), [both["c0"][:, 1], both["c1"][:, 1]])
+    np.testing.assert_array_equal(_each_alone(capture), both[:, :, 1])

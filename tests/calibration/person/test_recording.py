@@ -60,7 +60,7 @@ def test_the_command_calibrates_a_folder_from_the_person(
     if pose2sim:  # the other case looks for outlines
         monkeypatch.setattr(Outlines, "of", lambda *_: None)
     truth = ring(3)
-    seen = {name: found[:, 0] for name, found in detections(truth, 1.0).items()}
+    seen = {camera.name: found for camera, found in zip(truth, detections(truth, 1.0), strict=True)}
     folder, out = write_recording(tmp_path / "film", seen, pose2sim), tmp_path / "cameras"
     fov_deg = str(2 * np.rad2deg(np.arctan(0.5)))  # a focal length of 1000 px
     command = ["calibrate", str(folder), "--from", "person", "--height", "1.8", "--fov", fov_deg, "--out", str(out)]
