@@ -46,7 +46,7 @@ def test_evidence_before_and_after_refining_a_turned_camera(
     assert load_cameras(tmp_path, off).train_cameras == wave.train_cameras
 
 
-def test_matches_of_a_pair_count_for_both_cameras(wave: Capture, tmp_path: Path) -> None:
+def test_matches_of_a_pair_count_for_both_cameras_and_missing_evidence_is_named(wave: Capture, tmp_path: Path) -> None:
     # One point in the world, 3 px too low in the first camera: a residual of up to 3 px, shared between both images.
     cameras = [wave.cameras[name] for name in wave.train_cameras]
     keypoints = ranked_people(wave)[0].keypoints
@@ -61,6 +61,9 @@ def test_matches_of_a_pair_count_for_both_cameras(wave: Capture, tmp_path: Path)
     assert summary["silhouettes"] == {"01": {"rays": 0}, "02": {"rays": 0}}
     draw_evidence(tmp_path / "sheet.png", evidence, cameras, measure(cameras, keypoints))
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
+    nothing = dataclasses.replace(evidence, outlines=None, matches=Matches({}, 0))
+    summary = nothing.summarise(cameras, measure(cameras, keypoints))
+    assert summary["silhouettes"].startswith("none: ") and summary["match_pairs"] == "no overlap: no matches"
 
 
 def test_the_sheet_computes_outline_residuals_twice_and_draws_no_outline_seen_by_one_camera_only(
@@ -80,16 +83,3 @@ def test_the_sheet_computes_outline_residuals_twice_and_draws_no_outline_seen_by
     draw_evidence(tmp_path / "sheet.png", evidence, cameras, measure(cameras, keypoints))
     assert len(drawn) == len(cameras)  # keypoints alone
     assert len(calls) == 2
-
-
-def test_the_report_says_that_there_are_no_masks(wave: Capture) -> None:
-    cameras = [wave.cameras[name] for name in wave.train_cameras]
-    keypoints = ranked_people(wave)[0].keypoints
-    summary = Evidence(wave, keypoints, None, Matches({}, 0), None).summarise(cameras, measure(cameras, keypoints))
-    assert summary["silhouettes"].startswith("none: ") and summary["match_pairs"] == "no overlap: no matches"
-
-
-def test_a_single_camera_is_judged_by_the_ground(wave: Capture) -> None:
-    report = check_calibration(dataclasses.replace(wave, train_cameras=("01",)), CalibrationSettings())
-    assert report.evidence is None
-    assert any("standing on world height 0 the person is 1.7" in r for r in report.verdicts["01"].reasons)

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -148,27 +149,30 @@ def test_unlinked_cameras_are_refused() -> None:
         solve_rig(rig(), BOARD.corners_m, corners_px)
 
 
+def evidence(
+    root: Path, cameras: list[Camera], corners_px: np.ndarray, frames: Sequence[int] = range(FRAMES)
+) -> dict[str, Any]:
+    """Return the evidence of footage whose corners (C, F, N, 2) were found by the first C cameras of a capture."""
+    capture = write_capture(root, cameras, np.zeros((3, 2, 25, 3)))
+    assert board_evidence(capture) is None
+    BoardCorners(tuple("abc"[: len(corners_px)]), BOARD.corners_m, corners_px, 1, tuple(frames)).save(capture.root)
+    found = board_evidence(capture)
+    assert found is not None
+    return found
+
+
 def test_board_evidence_lists_unlinked_cameras(tmp_path: Path) -> None:
     corners_px = seen(rig(), {})
     corners_px[2] = np.nan
-    capture = write_capture(tmp_path, rig(), np.zeros((3, 2, 25, 3)))
-    BoardCorners(("a", "b", "c"), BOARD.corners_m, corners_px, 1, tuple(range(FRAMES))).save(capture.root)
-    found = board_evidence(capture)
-    assert found is not None and found["unlinked_cameras"] == ["c"] and list(found["cameras"]) == ["a", "b"]
-    BoardCorners(("a",), BOARD.corners_m, corners_px[:1], 1, tuple(range(FRAMES))).save(capture.root)
-    found = board_evidence(capture)
-    assert found is not None and found["unlinked_cameras"] == ["a"] and found["cameras"] == {}
+    three, one = evidence(tmp_path / "3", rig(), corners_px), evidence(tmp_path / "1", rig(), corners_px[:1])
+    assert three["unlinked_cameras"] == ["c"] and list(three["cameras"]) == ["a", "b"]
+    assert one["unlinked_cameras"] == ["a"] and one["cameras"] == {}
 
 
 def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
     cameras = rig()
-    stored = BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {}), 1, tuple(range(FRAMES)))
     bumped = [cameras[0], turned(cameras[1], 1.0), cameras[2]]
-    capture = write_capture(tmp_path / "bumped", bumped, np.zeros((3, 2, 25, 3)))
-    assert board_evidence(capture) is None
-    stored.save(capture.root)
-    found = board_evidence(capture)
-    assert found is not None
+    found = evidence(tmp_path, bumped, seen(cameras, {}))
     rms_px = {name: camera["rms_px"] for name, camera in found["cameras"].items()}
     # One degree at a focal length of 1000 px is 17.5 px; the other two agree and determine the board's pose.
     assert 10 < rms_px["b"] < 20 and max(rms_px["a"], rms_px["c"]) < 5
@@ -180,10 +184,7 @@ def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
 def test_board_evidence_allows_for_gaps_between_frames(tmp_path: Path) -> None:
     """In bursts of images that b takes LAG later, each camera still fits its own footage."""
     cameras, frames = rig(), tuple(first + i for first in (0, 20, 40, 60) for i in range(4))
-    capture = write_capture(tmp_path, cameras, np.zeros((3, 2, 25, 3)))
-    BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {"b": LAG}, frames), 1, frames).save(capture.root)
-    found = board_evidence(capture)
-    assert found is not None
+    found = evidence(tmp_path, cameras, seen(cameras, {"b": LAG}, frames), frames)
     assert max(camera["footage_rms_px"] for camera in found["cameras"].values()) < 0.6
     assert max(pair["turned_deg"] for pair in found["pairs"].values()) < 1
 
