@@ -147,7 +147,7 @@ def of_other_pictures(capture: Capture, keypoints: np.ndarray) -> list[str]:
     A ring of cameras cannot tell: mirrored in all of them, a person is merely turned about the ring's axis. The
     person's pixels come from masks, either given or from a network, else from the difference to a clean plate.
     """
-    rows = list(evenly_spaced(tuple(range(len(capture.frames))), LOOKED_AT))
+    rows = evenly_spaced(range(len(capture.frames)), LOOKED_AT)
     detected = dict(zip(capture.train_cameras, keypoints[:, rows], strict=True))
     people = {name: [_person(capture, name, capture.frames[row]) for row in rows] for name in detected}
     on = {name: _on(people[name], detected[name]) for name in detected}

@@ -10,13 +10,14 @@ from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, SINGLE_CAMERA_MISTAKES, measure, undo_mistake
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.refine import Refinement, judge_by_outlines, refine
-from hnerf.calibration.silhouettes import Outlines
 from hnerf.config import CalibrationSettings
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import detections, ring, true_error_px, turned, walk_m, write_capture
 
 SETTINGS = CalibrationSettings()
 NO_MATCHES = Matches({}, 0)
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 
 class OutlinesCosting:
@@ -29,11 +30,6 @@ class OutlinesCosting:
 
     def cost_px(self, cameras: Sequence[Camera]) -> float:
         return self.given_px if cameras is self.given else self.refined_px
-
-
-@pytest.fixture(autouse=True)
-def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Outlines, "of", lambda *_: None)
 
 
 def refined(
@@ -141,7 +137,6 @@ def test_a_camera_far_off_for_no_known_reason_is_left_to_refinement() -> None:
     assert undo_mistake(given, keypoints, measure(given, keypoints)) == (given, {})
 
 
-@pytest.mark.usefixtures("no_pictures")
 def test_the_report_gives_reasons_for_every_camera(tmp_path: Path) -> None:
     capture = write_capture(tmp_path, with_c2(lambda c: turned(c, 1.0)), detections(ring(4), 1))
     report = check_calibration(capture, SETTINGS)
