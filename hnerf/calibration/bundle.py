@@ -42,56 +42,8 @@ def adjust(
         used = inliers | (~reference[:, None] & (flat[..., 2] > 0) & np.isfinite(residuals_px))
         if used.sum() < MIN_OBSERVATIONS:
             break
-        loss_scale_px = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))
-        adjusted = _bundle_adjust(adjusted, flat, points_m, used, free, focal, loss_scale_px)
+        adjusted, _ = _bundle_adjust(adjusted, flat, points_m, used, residuals_px, free, focal)
     return align(adjusted, cameras) if freed.all() else adjusted
-
-
-def _bundle_adjust(
-    cameras: Sequence[Camera],
-    keypoints: np.ndarray,
-    points_m: np.ndarray,
-    used: np.ndarray,
-    free: Sequence[str],
-    focal: Sequence[str],
-    loss_scale_px: float,
-) -> list[Camera]:
-    """Solve once over the used observations (C, K): each (frame, joint) is a point, each camera one image."""
-    scene = pycolmap.Reconstruction()
-    config = pycolmap.BundleAdjustmentConfig()
-    for i, camera in enumerate(cameras, start=1):
-        _add_image(scene, i, camera, keypoints[i - 1, :, :2])
-        config.add_image(i)
-        if camera.name not in free:
-            config.set_constant_rig_from_world_pose(i)
-        if camera.name not in focal:
-            config.set_constant_cam_intrinsics(i)
-    if len(cameras) - len(free) < 2:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    _solve(scene, config, points_m, used, loss_scale_px)
-    return [
-        _as_solved(scene, i, camera, scene.camera(i).params[0] / camera.K[0, 0]) if camera.name in free else camera
-        for i, camera in enumerate(cameras, start=1)
-    ]
-
-
-def _solve(
-    scene: pycolmap.Reconstruction,
-    config: pycolmap.BundleAdjustmentConfig,
-    points_m: np.ndarray,
-    used: np.ndarray,
-    loss_scale_px: float,
-) -> None:
-    """Add points (K, 3), seen where `used` (C, K) is True, to a scene whose images are numbered from 1, and adjust
-    it."""
-    for k in np.flatnonzero(used.sum(0) >= 2):
-        track = [pycolmap.TrackElement(int(c) + 1, int(k)) for c in np.flatnonzero(used[:, k])]
-        scene.add_point3D(points_m[k], pycolmap.Track(track))
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_scale_px
-    options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
 
 
 def adjust_shared_lens(
@@ -105,14 +57,17 @@ def adjust_shared_lens(
     """
     chosen = evenly_spaced(range(keypoints.shape[1]), MAX_FRAMES)
     flat = keypoints[:, chosen].reshape(len(cameras), -1, 3)
-    shared = np.array([camera.name in unknown for camera in cameras])
+    names, side = [camera.name for camera in cameras], max(max(camera.size_px) for camera in cameras)
     adjusted, k1 = list(cameras), 0.0
     for _ in range(ROUNDS):
         points_m, residuals_px, used = triangulate(adjusted, undistort(flat, adjusted, unknown, k1))
         if used.sum() < MIN_OBSERVATIONS:
             break
-        scale_px = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))
-        adjusted, k1 = _solve_shared_lens(adjusted, flat, points_m, used, shared, distorted, k1, scale_px)
+        focal_px = float(np.median([camera.K[0, 0] for camera in adjusted]))
+        model, params = ("SIMPLE_RADIAL", [focal_px, 0, 0, k1]) if distorted else ("SIMPLE_PINHOLE", [focal_px, 0, 0])
+        lens = pycolmap.Camera(camera_id=len(cameras) + 1, model=model, params=params, width=side, height=side)
+        adjusted, scene = _bundle_adjust(adjusted, flat, points_m, used, residuals_px, names, unknown, lens)
+        k1 = float(scene.camera(lens.camera_id).params[3]) if distorted else 0.0
     return align(adjusted, cameras), k1
 
 
@@ -127,62 +82,80 @@ def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], unknown: Sequenc
     return straight
 
 
-def _solve_shared_lens(
+def _bundle_adjust(
     cameras: Sequence[Camera],
     keypoints: np.ndarray,
     points_m: np.ndarray,
     used: np.ndarray,
-    shared: np.ndarray,
-    distorted: bool,
-    k1: float,
-    loss_scale_px: float,
-) -> tuple[list[Camera], float]:
-    """Solve once over the used observations (C, K). Images of the cameras in `shared` (C,) are moved and scaled to one
-    principal point and focal length, so that they share the lens of one camera."""
+    residuals_px: np.ndarray,
+    free: Sequence[str],
+    focal: Sequence[str],
+    common: pycolmap.Camera | None = None,
+) -> tuple[list[Camera], pycolmap.Reconstruction]:
+    """Solve once over the used observations (C, K): each (frame, joint) is a point, each camera one image. common: the
+    lens of all cameras named in `focal`, if they share one. Returns the cameras and the solved scene."""
     scene = pycolmap.Reconstruction()
     config = pycolmap.BundleAdjustmentConfig()
-    focal_px = float(np.median([camera.K[0, 0] for camera in cameras]))
-    model = "SIMPLE_RADIAL" if distorted else "SIMPLE_PINHOLE"
-    params = [focal_px, 0, 0, k1] if distorted else [focal_px, 0, 0]
-    side = max(max(camera.size_px) for camera in cameras)
-    number = len(cameras) + 1
-    common = pycolmap.Camera(camera_id=number, model=model, params=params, width=side, height=side)
-    scene.add_camera_with_trivial_rig(common)
-    for i, camera in enumerate(cameras, start=1):
-        if shared[i - 1]:
-            points = (keypoints[i - 1, :, :2] - camera.K[:2, 2]) * (focal_px / np.diag(camera.K)[:2])
-            image = pycolmap.Image(camera.name, np.ascontiguousarray(points), number, i)
-            scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
-        else:
-            _add_image(scene, i, camera, keypoints[i - 1, :, :2])
-            config.set_constant_cam_intrinsics(i)
+    if common is not None:
+        scene.add_camera_with_trivial_rig(common)
+    lenses = [common if camera.name in focal else None for camera in cameras]
+    for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
+        _add_image(scene, i, camera, keypoints[i - 1, :, :2], lens)
         config.add_image(i)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    _solve(scene, config, points_m, used, loss_scale_px)
-    solved = scene.camera(number).params
-    zoom = solved[0] / focal_px
-    zooms = np.where(shared, zoom, 1.0)
-    found = [_as_solved(scene, i, camera, zooms[i - 1]) for i, camera in enumerate(cameras, start=1)]
-    return found, float(solved[3]) if distorted else 0.0
+        if camera.name not in free:
+            config.set_constant_rig_from_world_pose(i)
+        if camera.name not in focal:
+            config.set_constant_cam_intrinsics(i)
+    if len(cameras) - len(free) < 2:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    for k in np.flatnonzero(used.sum(0) >= 2):
+        track = [pycolmap.TrackElement(int(c) + 1, int(k)) for c in np.flatnonzero(used[:, k])]
+        scene.add_point3D(points_m[k], pycolmap.Track(track))
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))
+    options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
+    solved = [
+        _as_solved(scene, i, camera, lens) if camera.name in free else camera
+        for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1)
+    ]
+    return solved, scene
 
 
-def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keypoints_px: np.ndarray) -> None:
-    """Add a camera with one focal length to the scene; y is scaled by the pixel aspect ratio fx / fy, and skew is
-    removed."""
-    aspect = np.array([1, camera.K[0, 0] / camera.K[1, 1]])
-    fx, cx, cy = camera.K[0, 0], camera.K[0, 2], camera.K[1, 2] * aspect[1]
-    size = {"width": camera.width_px, "height": camera.height_px}
-    scene.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", params=[fx, cx, cy], **size)
-    )
-    straight_px = keypoints_px.copy()
-    straight_px[:, 0] -= camera.K[0, 1] / camera.K[1, 1] * (keypoints_px[:, 1] - camera.K[1, 2])
-    image = pycolmap.Image(camera.name, np.ascontiguousarray(straight_px * aspect), number, number)
+def _add_image(
+    scene: pycolmap.Reconstruction,
+    number: int,
+    camera: Camera,
+    keypoints_px: np.ndarray,
+    lens: pycolmap.Camera | None,
+) -> None:
+    """Add an image to the scene, moved and scaled to a lens that is there. If the lens is None, add the camera's own,
+    with one focal length: y is scaled by the pixel aspect ratio fx / fy, and skew is removed."""
+    fx, fy, centre_px = camera.K[0, 0], camera.K[1, 1], camera.K[:2, 2]
+    if lens is not None:
+        points = (keypoints_px - centre_px) * (lens.params[0] / np.array([fx, fy]))
+    else:
+        aspect = np.array([1, fx / fy])
+        points = keypoints_px.copy()
+        points[:, 0] -= camera.K[0, 1] / fy * (keypoints_px[:, 1] - centre_px[1])
+        points *= aspect
+        lens = pycolmap.Camera(
+            camera_id=number,
+            model="SIMPLE_PINHOLE",
+            params=[fx, *(centre_px * aspect)],
+            width=camera.width_px,
+            height=camera.height_px,
+        )
+        scene.add_camera_with_trivial_rig(lens)
+    image = pycolmap.Image(camera.name, np.ascontiguousarray(points), lens.camera_id, number)
     scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
 
 
-def _as_solved(scene: pycolmap.Reconstruction, number: int, camera: Camera, zoom: float) -> Camera:
-    pose = scene.image(number).cam_from_world()
+def _as_solved(scene: pycolmap.Reconstruction, number: int, camera: Camera, lens: pycolmap.Camera | None) -> Camera:
+    image = scene.image(number)
+    before_px = camera.K[0, 0] if lens is None else lens.params[0]
+    zoom, pose = scene.camera(image.camera_id).params[0] / before_px, image.cam_from_world()
     return dataclasses.replace(zoomed(camera, zoom), R=pose.rotation.matrix(), t_m=np.array(pose.translation))
 
 
