@@ -5,6 +5,7 @@ usage: python benchmarks/boards.py
 Needs `../shared/data/caliscope-charuco` beside this checkout. Writes `benchmarks/results/boards.json` and `.md`.
 """
 
+import dataclasses
 import time
 from typing import Any
 
@@ -42,18 +43,20 @@ def main() -> None:
     pairs, report = compare_pairs(shipped, fitted), calibration.report()
     visible = sum(camera["board_visible"] for camera in report["cameras"].values())
     found = sum(camera["of_these_found"] for camera in report["cameras"].values())
-    corners_m, seen_px = calibration.corners_m, calibration.fit.seen_px
-    every = calibration.fit.projected_px - calibration.corners_px
-    half = seen_px.shape[1] // 2
-    from_first_half = solve_rig(fitted, corners_m, seen_px[:, :half]).cameras
+    every, seen_px = calibration.fit.projected_px - calibration.corners.corners_px, calibration.fit.seen_px
+    whole, first, second = (
+        dataclasses.replace(calibration.corners, corners_px=px, frame_step=1, frames=tuple(range(px.shape[1])))
+        for px in (seen_px, *np.split(seen_px, [seen_px.shape[1] // 2], axis=1))
+    )
+    from_first_half = solve_rig(fitted, first).cameras
     figures: dict[str, Any] = {
         "found_share": found / visible,
         "turned_deg": max(pair["turned_deg"] for pair in pairs.values()),
         "moved_cm": max(pair["moved_cm"] for pair in pairs.values()),
         "rms_px": report["rms_px"],
         "rms_with_corners_off_plane_px": rms(np.linalg.norm(every[np.isfinite(every[..., 0])], axis=-1)),
-        "rms_held_out_px": rms(solve_boards(from_first_half, corners_m, seen_px[:, half:]).error_px()),
-        "rms_shipped_px": rms(solve_boards(shipped, corners_m, seen_px).error_px()),
+        "rms_held_out_px": rms(solve_boards(from_first_half, second).error_px()),
+        "rms_shipped_px": rms(solve_boards(shipped, whole).error_px()),
         "seconds": seconds,
     }
     result = where | {"footage": FOOTAGE, "protocol": PROTOCOL, "goals": GOALS, "figures": figures}

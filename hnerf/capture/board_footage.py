@@ -9,6 +9,7 @@ import dataclasses
 import logging
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -115,15 +116,20 @@ class BoardFootage:
 
 @dataclass(frozen=True)
 class BoardCorners:
-    """Corners of a board in a normalised capture, kept as `boards.npz`: corners_m (N, 3) on the board; corners_px (C,
-    F, N, 2) in the linear cameras' pixels, NaN where not seen, in every `frame_step`-th frame of the footage; frames
-    (F,): their numbers."""
+    """Corners of a board, which a normalised capture keeps as `boards.npz`: corners_m (N, 3) on the board; corners_px
+    (C, F, N, 2) in the linear cameras' pixels, NaN where not seen, in every `frame_step`-th frame of the footage;
+    frames (F,): their numbers."""
 
     cameras: tuple[str, ...]
     corners_m: np.ndarray
     corners_px: np.ndarray
     frame_step: int
     frames: tuple[int, ...]
+
+    def of(self, cameras: Sequence[str]) -> "BoardCorners":
+        """Return the corners that these cameras saw."""
+        rows = [self.cameras.index(name) for name in cameras]
+        return dataclasses.replace(self, cameras=tuple(cameras), corners_px=self.corners_px[rows])
 
     def save(self, root: Path) -> None:
         """Write `boards.npz` into a normalised capture."""

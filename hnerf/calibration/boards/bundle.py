@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
+from hnerf.capture.board_footage import BoardCorners
 from hnerf.capture.timing import median_step
 from hnerf.geometry.camera import Camera
 
@@ -61,34 +62,20 @@ class Adjustment:
     """A robust least-squares problem over board poses, time offsets, and the cameras that are `moving`. Unknowns in one
     vector: 6 per camera, 6 per frame (rotation, then translation), 1 per image that shows the board.
 
-    corners_m (N, 3) on the board; corners_px (C, F, N, 2) undistorted, NaN where not seen, of every `frame_step`-th
-    frame of the footage; frames (F,): their numbers, if known, which tell where some are missing; offsets are in frames
-    of the footage. Rotations are updated on the left, R <- exp(w) R (Triggs et al. 2000, Bundle Adjustment, section
-    2.2).
+    Offsets are in frames of the footage; numbers of frames tell where some are missing. Rotations are updated on the
+    left, R <- exp(w) R (Triggs et al. 2000, Bundle Adjustment, section 2.2).
     """
 
-    def __init__(
-        self,
-        cameras: Sequence[Camera],
-        corners_m: np.ndarray,
-        corners_px: np.ndarray,
-        boards: Poses,
-        moving: Sequence[bool],
-        frame_step: int,
-        frames: Sequence[int] | None = None,
-    ) -> None:
-        self.cameras, self.corners_m, self.corners_px, self.boards = cameras, corners_m, corners_px, boards
-        self.moving, self.frame_step = np.asarray(moving), frame_step
-        self.seen = np.isfinite(corners_px[..., 0])  # (C, F, N)
+    def __init__(self, cameras: Sequence[Camera], corners: BoardCorners, boards: Poses, moving: Sequence[bool]) -> None:
+        self.cameras, self.corners, self.boards, self.moving = cameras, corners, boards, np.asarray(moving)
+        self.seen = np.isfinite(corners.corners_px[..., 0])  # (C, F, N)
         self.camera, self.frame = np.nonzero(self.seen.any(-1))  # of each image
         self.picture, self.corner = np.nonzero(self.seen[self.camera, self.frame])  # of each observation
-        self.observed_px = corners_px[self.camera, self.frame][self.picture, self.corner]
+        self.observed_px = corners.corners_px[self.camera, self.frame][self.picture, self.corner]
         self.K = np.stack([camera.K for camera in cameras])
-        count, frame_count = corners_px.shape[:2]
-        self.before, self.after = _adjacent_frames(
-            self.seen.any((0, 2)), range(frame_count) if frames is None else frames
-        )
-        self.offsets = slice(6 * (count + frame_count), 6 * (count + frame_count) + len(self.camera))
+        self.before, self.after = _adjacent_frames(self.seen.any((0, 2)), corners.frames)
+        count = 6 * (len(cameras) + len(corners.frames))
+        self.offsets = slice(count, count + len(self.camera))
         self.size = self.offsets.stop
 
     def solve(self) -> BoardFit:
@@ -136,9 +123,9 @@ class Adjustment:
         ]
         offsets_frames = np.full(self.seen.shape[:2], np.nan)
         offsets_frames[self.camera, self.frame] = x[self.offsets]
-        projected_px = np.full_like(self.corners_px, np.nan)
+        projected_px = np.full_like(self.corners.corners_px, np.nan)
         projected_px[self.camera, self.frame] = self._project(R, t_m, boards, x[self.offsets])
-        return BoardFit(cameras, boards, self.corners_px, projected_px, offsets_frames)
+        return BoardFit(cameras, boards, self.corners.corners_px, projected_px, offsets_frames)
 
     def _poses(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, Poses]:
         """Return R (C, 3, 3) and t_m (C, 3) of the cameras, and the board poses."""
@@ -154,7 +141,7 @@ class Adjustment:
         board_R, board_t_m = self._boards_at_picture_time(boards, offsets)
         own = R[self.camera]
         to_camera, shift_m = own @ board_R, (own @ board_t_m[..., None])[..., 0] + t_m[self.camera]
-        x = np.einsum("pij,nj->pni", to_camera, self.corners_m) + shift_m[:, None]
+        x = np.einsum("pij,nj->pni", to_camera, self.corners.corners_m) + shift_m[:, None]
         uv = np.einsum("pij,pnj->pni", self.K[self.camera], x)
         return uv[..., :2] / uv[..., 2:]
 
@@ -162,7 +149,7 @@ class Adjustment:
         """Return each image's board pose at the image's own time: the parabola through its frame and the two adjacent
         ones, in translation and in the rotation vector relative to its frame. A missing neighbour mirrors the other
         one."""
-        frame, s = self.frame, offsets[:, None] / self.frame_step
+        frame, s = self.frame, offsets[:, None] / self.corners.frame_step
         own = np.arange(len(self.before))
         no_before, no_after = (self.before == own)[:, None], (self.after == own)[:, None]
         beside = self.before, self.after

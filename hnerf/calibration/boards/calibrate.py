@@ -14,7 +14,7 @@ from hnerf.calibration.boards import rig
 from hnerf.calibration.boards.bundle import BoardFit, Poses
 from hnerf.calibration.boards.lens import LensEstimate, estimate_lens
 from hnerf.calibration.boards.picture import draw_boards
-from hnerf.capture.board_footage import BoardFootage, load_board_corners, read_board_footage
+from hnerf.capture.board_footage import BoardCorners, BoardFootage, load_board_corners, read_board_footage
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_calibration
 from hnerf.capture.ingest import recognise
@@ -34,21 +34,21 @@ log = logging.getLogger("hnerf.calibration")
 @dataclass(frozen=True)
 class BoardCalibration:
     """Result of a board calibration. lenses: with distortion, as recorded; intrinsics: their source, in words;
-    corners_m (N, 3); corners_px (C, F, N, 2): all detected corners, undistorted; `fit` holds those used."""
+    corners: all that were detected; `fit` holds those used."""
 
     lenses: dict[str, Lens]
     intrinsics: dict[str, str]
-    corners_m: np.ndarray
-    corners_px: np.ndarray
+    corners: BoardCorners
     fit: BoardFit
 
     def report(self) -> dict[str, Any]:
         """Return the content of `report.json`. Residuals in undistorted pixels, offsets in frames of the footage."""
-        visible, found = visible_and_found(self.fit, self.corners_m)
+        visible, found = visible_and_found(self.fit, self.corners.corners_m)
         cameras = {
             camera.name: _figures(self.fit, i)
             | {
-                "corners_not_flat": int(np.isfinite(self.corners_px[i, ..., 0]).sum()) - len(self.fit.error_px(i)),
+                "corners_not_flat": int(np.isfinite(self.corners.corners_px[i, ..., 0]).sum())
+                - len(self.fit.error_px(i)),
                 "board_visible": int(visible[i].sum()),
                 "of_these_found": int((visible[i] & found[i]).sum()),
                 "intrinsics": self.intrinsics[camera.name],
@@ -79,18 +79,17 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
         )
     _check_board_found(footage)
     lenses, intrinsics = _intrinsics(folder, footage)
-    corners_m = footage.board.corners_m
     corners_px = np.stack(
         [undistort_points(footage.corners_px[name], lens.K, lens.distortion) for name, lens in lenses.items()]
     )
     cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
-    flat_px = rig.planar_corners(corners_m, corners_px)
-    fit = rig.solve_rig(cameras, corners_m, flat_px, footage.frame_step, footage.frames)
+    corners = BoardCorners(tuple(lenses), footage.board.corners_m, corners_px, footage.frame_step, footage.frames)
+    fit = rig.solve_rig(cameras, rig.planar_corners(corners))
     if ground_frame is not None:
         fit = _on_ground(fit, footage, ground_frame)
     lenses = {c.name: dataclasses.replace(lenses[c.name], R=c.R, t_m=c.t_m) for c in fit.cameras}
-    return BoardCalibration(lenses, intrinsics, corners_m, corners_px, fit)
+    return BoardCalibration(lenses, intrinsics, corners, fit)
 
 
 def board_evidence(capture: Capture) -> dict[str, Any] | None:
@@ -103,24 +102,20 @@ def board_evidence(capture: Capture) -> dict[str, Any] | None:
     stored = load_board_corners(capture.root)
     if stored is None:
         return None
-    known = [i for i, name in enumerate(stored.cameras) if name in capture.cameras]
-    cameras, corners_px = [capture.cameras[stored.cameras[i]] for i in known], stored.corners_px[known]
-    corners_px = rig.planar_corners(stored.corners_m, corners_px)
-    chosen = rig.largest_linked_group(corners_px)
-    names = [camera.name for camera in cameras]
-    if len(chosen) < 2:
-        return {"frames": corners_px.shape[1], "cameras": {}, "pairs": {}, "unlinked_cameras": names}
-    cameras, corners_px = [cameras[i] for i in chosen], corners_px[chosen]
-    seen = stored.corners_m, corners_px, stored.frame_step, stored.frames
-    own, given = (solve(cameras, *seen) for solve in (rig.solve_rig, rig.solve_boards))
+    corners = rig.planar_corners(stored.of([name for name in stored.cameras if name in capture.cameras]))
+    names = rig.largest_linked_group(corners)
+    if len(names) < 2:
+        return {"frames": len(corners.frames), "cameras": {}, "pairs": {}, "unlinked_cameras": [*corners.cameras]}
+    cameras = [capture.cameras[name] for name in names]
+    own, given = (solve(cameras, corners.of(names)) for solve in (rig.solve_rig, rig.solve_boards))
     figures = {
         camera.name: _figures(given, i) | {"footage_rms_px": rms(own.error_px(i))} for i, camera in enumerate(cameras)
     }
     return {
-        "frames": corners_px.shape[1],
+        "frames": len(corners.frames),
         "cameras": figures,
         "pairs": rig.compare_pairs(cameras, own.cameras),
-        "unlinked_cameras": [name for i, name in enumerate(names) if i not in chosen],
+        "unlinked_cameras": [name for name in corners.cameras if name not in names],
     }
 
 

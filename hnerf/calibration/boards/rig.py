@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from hnerf.calibration.boards.bundle import Adjustment, BoardFit, Poses
+from hnerf.capture.board_footage import BoardCorners
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
@@ -29,12 +30,13 @@ def fixes_pose(corners_m: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return (seen.sum(-1) >= MIN_CORNERS) & ((in_row >= 2).sum(-1) >= 2)
 
 
-def planar_corners(corners_m: np.ndarray, corners_px: np.ndarray) -> np.ndarray:
-    """Return corners (C, F, N, 2) without those off the plane of the others in their image, and without images whose
-    corners no longer determine a pose.
+def planar_corners(corners: BoardCorners) -> BoardCorners:
+    """Return corners without those off the plane of the others in their image, and without images whose corners no
+    longer determine a pose.
 
     The undistorted corners of a board are a homography of the flat ones, whatever the cameras' poses.
     """
+    corners_m, corners_px = corners.corners_m, corners.corners_px
     kept = np.full_like(corners_px, np.nan)
     for picture in zip(*np.nonzero(fixes_pose(corners_m, np.isfinite(corners_px[..., 0]))), strict=True):
         seen = np.isfinite(corners_px[picture][:, 0])
@@ -43,53 +45,37 @@ def planar_corners(corners_m: np.ndarray, corners_px: np.ndarray) -> np.ndarray:
         flat[seen] = inlier is not None and inlier.ravel() > 0
         if fixes_pose(corners_m, flat):
             kept[picture][flat] = corners_px[picture][flat]
-    return kept
+    return dataclasses.replace(corners, corners_px=kept)
 
 
-def largest_linked_group(corners_px: np.ndarray) -> np.ndarray:
-    """Return the indices of the largest group of cameras linked by shared views of the board. corners_px (C, F, N, 2)
-    of `planar_corners`."""
-    found = np.isfinite(corners_px[..., 0]).any(-1).astype(int)
+def largest_linked_group(corners: BoardCorners) -> list[str]:
+    """Return the largest group of cameras that are linked by shared views of the board, as `planar_corners` left
+    them."""
+    found = np.isfinite(corners.corners_px[..., 0]).any(-1).astype(int)
     _, group = connected_components(found @ found.T >= MIN_SHARED)
-    return np.flatnonzero(group == np.bincount(group, minlength=1).argmax())
+    largest = np.bincount(group, minlength=1).argmax()
+    return [name for name, number in zip(corners.cameras, group, strict=True) if number == largest]
 
 
-def solve_rig(
-    cameras: Sequence[Camera],
-    corners_m: np.ndarray,
-    corners_px: np.ndarray,
-    frame_step: int = 1,
-    frames: Sequence[int] | None = None,
-) -> BoardFit:
-    """Solve for the poses of cameras with known intrinsics; the first camera defines the world.
-
-    corners_m (N, 3); corners_px (C, F, N, 2) undistorted, NaN where not seen, of `planar_corners`, in every
-    `frame_step`-th frame of the footage; frames (F,): their numbers, if known. Raises InputError if the board does not
-    link them.
-    """
-    alone = ", ".join(cameras[i].name for i in set(range(len(cameras))).difference(largest_linked_group(corners_px)))
-    if alone:
+def solve_rig(cameras: Sequence[Camera], corners: BoardCorners) -> BoardFit:
+    """Solve for the poses of cameras with known intrinsics, from `planar_corners`; the first camera defines the world.
+    Raises InputError if the board does not link them."""
+    linked = largest_linked_group(corners)
+    if alone := ", ".join(name for name in corners.cameras if name not in linked):
         raise InputError(
             f"calibration/extrinsic: camera {alone}: shares fewer than {MIN_SHARED} frames of the board with the other "
             "cameras; film it where two cameras can see it simultaneously"
         )
-    views = _view_poses(cameras, corners_m, corners_px)
+    views = _view_poses(cameras, corners)
     cameras = _chain_poses(cameras, views)
-    boards = _board_poses(cameras, corners_m, corners_px, views)
     moving = [i > 0 for i in range(len(cameras))]
-    return Adjustment(cameras, corners_m, corners_px, boards, moving, frame_step, frames).solve()
+    return Adjustment(cameras, corners, _board_poses(cameras, corners, views), moving).solve()
 
 
-def solve_boards(
-    cameras: Sequence[Camera],
-    corners_m: np.ndarray,
-    corners_px: np.ndarray,
-    frame_step: int = 1,
-    frames: Sequence[int] | None = None,
-) -> BoardFit:
+def solve_boards(cameras: Sequence[Camera], corners: BoardCorners) -> BoardFit:
     """Solve as `solve_rig` does, with fixed cameras."""
-    boards = _board_poses(cameras, corners_m, corners_px, _view_poses(cameras, corners_m, corners_px))
-    return Adjustment(cameras, corners_m, corners_px, boards, [False] * len(cameras), frame_step, frames).solve()
+    boards = _board_poses(cameras, corners, _view_poses(cameras, corners))
+    return Adjustment(cameras, corners, boards, [False] * len(cameras)).solve()
 
 
 def compare_pairs(cameras: Sequence[Camera], others: Sequence[Camera]) -> dict[str, dict[str, float]]:
@@ -106,12 +92,12 @@ def compare_pairs(cameras: Sequence[Camera], others: Sequence[Camera]) -> dict[s
     return pairs
 
 
-def _view_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray) -> Views:
+def _view_poses(cameras: Sequence[Camera], corners: BoardCorners) -> Views:
     """Return the board pose in each image that `planar_corners` kept."""
     poses: Views = {}
-    for i, f in zip(*np.nonzero(np.isfinite(corners_px[..., 0]).any(-1)), strict=True):
-        seen = np.isfinite(corners_px[i, f, :, 0])
-        points = corners_m[seen], corners_px[i, f, seen], cameras[i].K, None
+    seen = np.isfinite(corners.corners_px[..., 0])
+    for i, f in zip(*np.nonzero(seen.any(-1)), strict=True):
+        points = corners.corners_m[seen[i, f]], corners.corners_px[i, f, seen[i, f]], cameras[i].K, None
         _, turn, shift = cv2.solvePnP(*points, flags=cv2.SOLVEPNP_IPPE)
         turn, shift = cv2.solvePnPRefineLM(*points, turn, shift)
         poses[int(i), int(f)] = cv2.Rodrigues(turn)[0], shift.ravel()
@@ -147,16 +133,17 @@ def _robust_pose(steps: list[Pose]) -> Pose:
     return R[best], np.median(t_m[near], axis=0)
 
 
-def _board_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, views: Views) -> Poses:
+def _board_poses(cameras: Sequence[Camera], corners: BoardCorners, views: Views) -> Poses:
     """Return the board pose in the world for each frame: of the poses that single cameras give, the one that fits all
     cameras best."""
-    frames = corners_px.shape[1]
+    frames = len(corners.frames)
     R, t_m, best_px = np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), np.full(frames, np.inf)
     for (i, f), (view_R, view_t_m) in views.items():
         world_R = cameras[i].R.T @ view_R
         world_t_m = cameras[i].R.T @ (view_t_m - cameras[i].t_m)
-        points = corners_m @ world_R.T + world_t_m
-        errors_px = [np.linalg.norm(c.project(points)[0] - corners_px[k, f], axis=-1) for k, c in enumerate(cameras)]
+        points = corners.corners_m @ world_R.T + world_t_m
+        seen_px = corners.corners_px[:, f]
+        errors_px = [np.linalg.norm(c.project(points)[0] - px, axis=-1) for c, px in zip(cameras, seen_px, strict=True)]
         total_px = np.nansum(np.minimum(errors_px, FAR_PX))
         if total_px < best_px[f]:
             R[f], t_m[f], best_px[f] = world_R, world_t_m, total_px

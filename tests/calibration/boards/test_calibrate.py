@@ -13,13 +13,7 @@ from hnerf.calibration.boards import calibrate as calibration_boards
 from hnerf.calibration.boards.bundle import Adjustment, Poses
 from hnerf.calibration.boards.calibrate import board_evidence, calibrate_from_boards, visible_and_found
 from hnerf.calibration.boards.lens import estimate_lens
-from hnerf.calibration.boards.rig import (
-    compare_pairs,
-    fixes_pose,
-    planar_corners,
-    solve_boards,
-    solve_rig,
-)
+from hnerf.calibration.boards.rig import compare_pairs, fixes_pose, planar_corners, solve_boards, solve_rig
 from hnerf.capture.board_footage import Board, BoardCorners, BoardFootage
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.easymocap import EasyMocap
@@ -64,6 +58,11 @@ def seen(cameras: list[Camera], lags: dict[str, float], frames: Sequence[int] = 
     return corners_px + NOISE_PX * np.random.default_rng(0).normal(size=corners_px.shape)
 
 
+def corners_of(corners_px: np.ndarray, frames: Sequence[int] = range(FRAMES), frame_step: int = 1) -> BoardCorners:
+    """Return the corners (C, F, N, 2) that the first C cameras saw."""
+    return BoardCorners(tuple("abc"[: len(corners_px)]), BOARD.corners_m, corners_px, frame_step, tuple(frames))
+
+
 def test_each_residual_depends_only_on_the_unknowns_that_the_solver_is_told() -> None:
     """The full Jacobian, by differences, is zero outside the pattern. Frame 2 is missing, and c does not see frame
     0."""
@@ -72,7 +71,7 @@ def test_each_residual_depends_only_on_the_unknowns_that_the_solver_is_told() ->
     corners_px[2, 0] = np.nan
     R, t_m = zip(*(board_at(frame) for frame in frames), strict=True)
     boards = Poses(np.array(R), np.array(t_m))
-    adjustment = Adjustment(cameras, BOARD.corners_m, corners_px, boards, [False, True, True], 1, frames)
+    adjustment = Adjustment(cameras, corners_of(corners_px, frames), boards, [False, True, True])
     x = 0.01 * np.random.default_rng(0).normal(size=adjustment.size)
     steps = 1e-4 * np.eye(adjustment.size)
     jacobian = np.stack([adjustment.residuals(x + h) - adjustment.residuals(x - h) for h in steps], -1)
@@ -98,7 +97,7 @@ def test_cameras_and_their_lag_are_found() -> None:
     corners_px = seen(cameras, {"b": LAG})
     corners_px[2, :4] = np.nan
     corners_px[0, 5, 3] += 30.0  # one corner mistaken for another
-    fit = solve_rig(cameras, BOARD.corners_m, planar_corners(BOARD.corners_m, corners_px))
+    fit = solve_rig(cameras, planar_corners(corners_of(corners_px)))
     for figures in compare_pairs(cameras, fit.cameras).values():
         assert figures["turned_deg"] < 0.3 and figures["moved_cm"] < 0.8  # 4 degrees and 8 cm if b's lag is ignored
     # Only differences between cameras can be known: a and c were synchronised, b was later.
@@ -112,7 +111,7 @@ def test_cameras_and_their_lag_are_found() -> None:
 def test_offsets_are_in_frames_of_the_footage() -> None:
     """If only every second frame is used, a lag of 0.4 of the interval between images is 0.8 frames."""
     cameras = rig()
-    fit = solve_rig(cameras, BOARD.corners_m, planar_corners(BOARD.corners_m, seen(cameras, {"b": LAG})), frame_step=2)
+    fit = solve_rig(cameras, planar_corners(corners_of(seen(cameras, {"b": LAG}), frame_step=2)))
     lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
     assert lag == pytest.approx(2 * LAG, abs=0.1)
     assert max(figures["turned_deg"] for figures in compare_pairs(cameras, fit.cameras).values()) < 0.3
@@ -121,8 +120,7 @@ def test_offsets_are_in_frames_of_the_footage() -> None:
 def test_frames_across_a_gap_are_not_neighbours() -> None:
     """The board does not move straight from one burst of images to the next; assuming so costs 2 degrees and 5 cm."""
     cameras, frames = rig(), [first + i for first in (0, 20, 40, 60) for i in range(4)]
-    corners_px = planar_corners(BOARD.corners_m, seen(cameras, {"b": LAG}, frames))
-    fit = solve_rig(cameras, BOARD.corners_m, corners_px, frames=frames)
+    fit = solve_rig(cameras, planar_corners(corners_of(seen(cameras, {"b": LAG}, frames), frames)))
     for figures in compare_pairs(cameras, fit.cameras).values():
         assert figures["turned_deg"] < 1 and figures["moved_cm"] < 2
     assert np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0]) == pytest.approx(LAG, abs=0.1)
@@ -132,7 +130,7 @@ def test_off_plane_corners_and_images_with_few_corners_are_dropped() -> None:
     corners_px = seen(rig(), {})[:1, :2]
     corners_px[0, 0, 7] += [3.0, 0]
     corners_px[0, 1, 5:] = np.nan  # five are left
-    kept = np.isfinite(planar_corners(BOARD.corners_m, corners_px)[..., 0])
+    kept = np.isfinite(planar_corners(corners_of(corners_px, range(2))).corners_px[..., 0])
     assert np.flatnonzero(~kept[0, 0]).tolist() == [7] and not kept[0, 1].any()
 
 
@@ -146,7 +144,7 @@ def test_unlinked_cameras_are_refused() -> None:
     corners_px = seen(rig(), {})
     corners_px[2, 2:] = np.nan  # c shares only two frames
     with pytest.raises(InputError, match="camera c: shares fewer than 3 frames"):
-        solve_rig(rig(), BOARD.corners_m, corners_px)
+        solve_rig(rig(), corners_of(corners_px))
 
 
 def evidence(
@@ -155,7 +153,7 @@ def evidence(
     """Return the evidence of footage whose corners (C, F, N, 2) were found by the first C cameras of a capture."""
     capture = write_capture(root, cameras, np.zeros((3, 2, 25, 3)))
     assert board_evidence(capture) is None
-    BoardCorners(tuple("abc"[: len(corners_px)]), BOARD.corners_m, corners_px, 1, tuple(frames)).save(capture.root)
+    corners_of(corners_px, frames).save(capture.root)
     found = board_evidence(capture)
     assert found is not None
     return found
@@ -197,7 +195,7 @@ def test_a_visible_board_faces_the_camera_is_inside_the_image_and_found_by_anoth
     corners_px = np.stack([[c.project(BOARD.corners_m @ R.T + t)[0] for R, t in zip(boards.R, boards.t_m, strict=True)]
                            for c in cameras])  # fmt: skip
     corners_px[:2, 2] = np.nan
-    fit = solve_boards(cameras, BOARD.corners_m, corners_px)
+    fit = solve_boards(cameras, corners_of(corners_px, range(4)))
     visible, found = visible_and_found(dataclasses.replace(fit, boards=boards), BOARD.corners_m)
     assert visible[:, 0].all() and not visible[:, 1].any() and not visible[:, 3].any()
     assert visible[:, 2].tolist() == [True, True, False] and found[:, 2].tolist() == [False, False, True]
