@@ -23,9 +23,10 @@ from hnerf.calibration.bundle import align
 from hnerf.calibration.clocks.estimate import estimate_clocks
 from hnerf.calibration.clocks.keypoints import Track
 from hnerf.calibration.diagnosis import body_height_m, measure
+from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
-from hnerf.calibration.refine import Refinement, refine
+from hnerf.calibration.refine import refine
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.subject import ranked_people
@@ -86,8 +87,8 @@ def _reference(capture: Capture) -> list[Camera]:
     given = [capture.cameras[name] for name in capture.train_cameras]
     if capture.name != REAL:
         return given
-    refinement: Refinement = refine(capture, given, keypoints, None, Matches.of(capture), CalibrationSettings())
-    return refinement.cameras
+    evidence = Evidence(capture, keypoints, None, Matches.of(capture), None)
+    return refine(evidence, given, CalibrationSettings()).cameras
 
 
 def _guessed(camera: Camera) -> Camera:

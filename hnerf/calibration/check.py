@@ -65,7 +65,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     synchronised, held_out_px, notes = synchronise_capture(capture, cameras, keypoints, settings)
     keypoints = keypoints if synchronised is capture else ranked_people(synchronised)[0].keypoints
     evidence = Evidence.of(synchronised, keypoints)
-    refinement = refine(synchronised, cameras, keypoints, evidence.outlines, evidence.matches, settings)
+    refinement = refine(evidence, cameras, settings)
     used = [new if new is old else _rounded(new) for old, new in zip(cameras, refinement.cameras, strict=True)]
     after = measure(used, keypoints)
     _check_agreement(capture, after, settings)

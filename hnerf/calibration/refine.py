@@ -9,6 +9,7 @@ import numpy as np
 
 from hnerf.calibration.bundle import adjust
 from hnerf.calibration.diagnosis import held_out_parts, measure, trimmed_cost_px
+from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.outline_adjustment import FRAMES, follow_outlines
 from hnerf.calibration.silhouettes import Outlines
@@ -44,21 +45,14 @@ class _Candidate:
     cost_px: float
 
 
-def refine(
-    capture: Capture,
-    cameras: list[Camera],
-    keypoints: np.ndarray,
-    outlines: Outlines | None,
-    matches: Matches,
-    settings: CalibrationSettings,
-) -> Refinement:
+def refine(evidence: Evidence, cameras: list[Camera], settings: CalibrationSettings) -> Refinement:
     """Adjust the cameras that do not fit the others. The given `cameras` themselves are returned unless held-out frames
     improve.
 
     Cameras are freed one by one with the others fixed; all are freed together if more than one needs it or residuals
-    stay too large. A change that the image matches of two cameras contradict is not accepted. keypoints (C, frames, 25,
-    3).
+    stay too large. A change that the image matches of two cameras contradict is not accepted.
     """
+    capture, keypoints, outlines, matches = evidence.capture, evidence.keypoints, evidence.outlines, evidence.matches
     cost_factor = 1 - settings.min_improvement
     held_out_px = {"as given": held_out_cost_px(cameras, keypoints, ())}
     chosen, kept = _refine_one_by_one(cameras, keypoints, matches, cost_factor, held_out_px)

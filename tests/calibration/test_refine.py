@@ -8,6 +8,7 @@ import pytest
 
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, SINGLE_CAMERA_MISTAKES, measure, undo_mistake
+from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.refine import Refinement, judge_by_outlines, refine
 from hnerf.config import CalibrationSettings
@@ -35,7 +36,8 @@ class OutlinesCosting:
 def refined(
     root: Path, cameras: list[Camera], keypoints: np.ndarray, outlines: Any = None, matches: Matches = NO_MATCHES
 ) -> Refinement:
-    return refine(write_capture(root, cameras, keypoints), cameras, keypoints, outlines, matches, SETTINGS)
+    evidence = Evidence(write_capture(root, cameras, keypoints), keypoints, outlines, matches, None)
+    return refine(evidence, cameras, SETTINGS)
 
 
 def with_c2(change: Any) -> list[Camera]:
