@@ -49,7 +49,7 @@ def main() -> None:
 def jobs(scratch: Path) -> dict[str, tuple[Path, str, tuple[str, ...]]]:
     """Return capture, preset and changes of settings for each run."""
     moving, still = synthesise(scratch / "moving"), synthesise(scratch / "still", "train_frames=1")
-    chosen = {"demo": (moving, "demo", ("asset.texture_px=256",))}
+    chosen: dict[str, tuple[Path, str, tuple[str, ...]]] = {"demo": (moving, "demo", ("asset.texture_px=256",))}
     wave = SHARED / "data" / "valid-wave"
     if wave.is_dir():
         chosen["wave"] = (wave, "fast", ("training.steps=100", "evaluation.max_images=4", *FEW[1:], *ASSET))

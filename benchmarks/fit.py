@@ -14,9 +14,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from provenance import SHARED, provenance, provenance_line, store_and_captures, table, write_result
+from segmentation import true_mask
 
 from flows.preparation import prepare_training, with_detections
 from hnerf.body.fit_result import BodyFit
@@ -63,12 +63,11 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     recording, calibration, _, made = prepare_training(store, recording, settings)
     capture, fit = calibrated_capture(recording, calibration), BodyFit.load(made.root)
-    joints = joint_errors(made, fit, folder)
+    joints = joint_errors(made, folder)
     ious, outside = [], []
     for frame, vertices_m in zip(fit.frames, fit.vertices_m().numpy(), strict=True):
         for name in capture.train_cameras:
-            path = folder / "ground_truth" / "masks" / name / f"{frame:06d}.png"
-            mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 127
+            mask = true_mask(folder, name, frame)
             body = silhouette(capture.cameras[name], vertices_m, fit.rig.faces.numpy())
             ious.append((body & mask).sum() / (body | mask).sum())
             outside.append((body & ~mask).sum() / mask.sum())
@@ -81,13 +80,14 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
     }
 
 
-def joint_errors(made: Artifact, fit: BodyFit, folder: Path) -> dict[str, Any]:
+def joint_errors(made: Artifact, folder: Path) -> dict[str, Any]:
     """Return the errors of a fit's limb joints according to the independent program, and how far they are constant."""
     scoring = runpy.run_path(str(SHARED / "accept" / "score_run.py"))
     with tempfile.TemporaryDirectory() as subject:
         (Path(subject) / "fit").symlink_to(made.root)
         found: dict[str, Any] = scoring["joints"](Path(subject), folder)
-    truth, sides = np.load(folder / "ground_truth" / "joints.npz"), {"L": "Left", "R": "Right"}
+    fit, truth = BodyFit.load(made.root), np.load(folder / "ground_truth" / "joints.npz")
+    sides = {"L": "Left", "R": "Right"}
     pairs = product(scoring["LIMBS"].items(), sides.items())
     names = [(f"{bone}.{suffix}", f"rig:{side}{joint}") for (bone, joint), (suffix, side) in pairs]
     ours = [fit.rig.joint_names.index(bone) for bone, _ in names]

@@ -49,7 +49,7 @@ def shared(
 ) -> Result:
     """Return a timed result of the whole pipeline on one capture. without: names of folders that are removed from the
     capture."""
-    command = ("score_shared.py", capture, "--preset", preset, "--store", "{new}", "--name", name)
+    command: tuple[str, ...] = ("score_shared.py", capture, "--preset", preset, "--store", "{new}", "--name", name)
     command += tuple(f"--set={change}" for change in changes)
     command += ("--without", *without) if without else ()
     return Result(name, command, (f"{name}.*",), (capture,), (preset,), ("flows.train_subject",), threads)
@@ -59,8 +59,8 @@ def on_gpu(capture: str, preset: str, *changes: str) -> Result:
     """Return a result of training and evaluation on a GPU, for a subject whose stages up to the body fit are in the
     store."""
     name = f"gpu-{preset}-{capture}"
-    command = ("gpu.py", f"{{store}}/subjects/{capture}", f"../shared/data/{capture}", "{new}", "--preset", preset)
-    command += tuple(f"--set={change}" for change in changes)
+    captured = f"{{store}}/subjects/{capture}", f"../shared/data/{capture}"
+    command = ("gpu.py", *captured, "{new}", "--preset", preset, *(f"--set={change}" for change in changes))
     return Result(name, command, (f"{name}.*",), (capture,), (preset,), gpu=True)
 
 
@@ -77,7 +77,7 @@ def study(
     `synth`. seconds: of each training, instead of the study's."""
     capture = "performer" if synth else "valid-wave"
     title = f"{kind}/{capture}-{name}"
-    command = ("studies.py", store, capture, kind, name, "--methods", ",".join(methods))
+    command: tuple[str, ...] = ("studies.py", store, capture, kind, name, "--methods", ",".join(methods))
     command += (f"--seconds={seconds}",) if seconds else ()
     command += tuple(f"--synth={setting}" for setting in synth)
     captures = () if synth else (capture,)
@@ -89,7 +89,7 @@ def study(
 def ablations(preset: str, *changes: str, rows: tuple[str, ...] = ()) -> Result:
     """Return a study on valid-wave of the method without each of its parts, or only without the parts that `rows`
     names."""
-    command = ("studies.py", "{store}", "valid-wave", "ablations", preset)
+    command: tuple[str, ...] = ("studies.py", "{store}", "valid-wave", "ablations", preset)
     command += tuple(f"--set={change}" for change in changes)
     command += ("--methods", ",".join(f"no-{row}" for row in rows)) if rows else ()
     title = f"ablations/valid-wave-{preset}{'-part' if rows else ''}"

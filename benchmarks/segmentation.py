@@ -101,7 +101,7 @@ def ious(folder: Path, capture: Capture, masks: Masks) -> dict[tuple[str, int], 
     """Return the IoU of each training camera and frame."""
     found = {}
     for view in ((camera, frame) for camera in capture.train_cameras for frame in capture.frames):
-        true = truth(folder, *view)
+        true = true_mask(folder, *view)
         mask = masks.get(*view) if view in masks else np.zeros_like(true)
         found[view] = float((mask & true).sum() / (mask | true).sum())
     return found
@@ -112,7 +112,7 @@ def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
     by_view = ious(folder, capture, masks)
     wrong = []
     for view in masks.encoded:
-        mask, true = masks.get(*view), truth(folder, *view)
+        mask, true = masks.get(*view), true_mask(folder, *view)
         wrong.append([(mask & ~true).sum() / true.sum(), (true & ~mask).sum() / true.sum()])
     values = list(by_view.values())
     return {
@@ -124,7 +124,7 @@ def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
     }
 
 
-def truth(folder: Path, camera: str, frame: int) -> np.ndarray:
+def true_mask(folder: Path, camera: str, frame: int) -> np.ndarray:
     """Return the true mask, (H, W) bool: True where the ray through the pixel's centre hits the person."""
     image = cv2.imread(str(folder / "ground_truth" / "masks" / camera / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE)
     assert image is not None, f"{folder}: no true mask of camera {camera}, frame {frame}"
@@ -136,7 +136,7 @@ def worst_frames(folder: Path, capture: Capture, masks: Masks) -> np.ndarray:
     by_view = ious(folder, capture, masks)
     cells = []
     for view in sorted(masks.encoded, key=lambda view: by_view[view])[:SHEET_FRAMES]:
-        mask, true = masks.get(*view), truth(folder, *view)
+        mask, true = masks.get(*view), true_mask(folder, *view)
         picture = (0.6 * capture.image(*view)).astype(np.uint8)
         picture[mask & ~true], picture[true & ~mask] = (255, 0, 0), (0, 255, 255)
         cell = picture[bounding_window(mask | true)]
