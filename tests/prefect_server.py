@@ -28,8 +28,8 @@ def prefect_server(
     url = f"http://127.0.0.1:{port}/api"
     where = ("--host", "127.0.0.1", "--port", str(port))
     start = [sys.executable, "-m", "prefect", "server", "start", "--no-ui", *where]
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(start, env=environment, cwd=folder, **silent) as server:
+    null = subprocess.DEVNULL
+    with subprocess.Popen(start, env=environment, cwd=folder, stdout=null, stderr=null) as server:
         try:
             wait_for(f"{url}/health", patience_s)
             yield url

@@ -266,7 +266,8 @@ def fetched(store: Path, names: list[str]) -> Path:
 
     store.mkdir()
     for name in names:
-        get_or_compute(Bucket.at(os.environ["HNERF_BUCKET"]), Store(store), *name.split("/"), refuse)
+        stage, key = name.split("/")
+        get_or_compute(Bucket.at(os.environ["HNERF_BUCKET"]), Store(store), stage, key, refuse)
     return store
 
 
