@@ -93,7 +93,7 @@ def _bundle_adjust(
     common: pycolmap.Camera | None = None,
 ) -> tuple[list[Camera], pycolmap.Reconstruction]:
     """Solve once over the used observations (C, K): each (frame, joint) is a point, each camera one image. common: the
-    lens of all cameras named in `focal`, if they share one. Returns the cameras and the solved scene."""
+    lens of all cameras named in `focal`, if they share one. Return the cameras and the solved scene."""
     scene = pycolmap.Reconstruction()
     config = pycolmap.BundleAdjustmentConfig()
     if common is not None:

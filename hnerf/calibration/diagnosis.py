@@ -66,19 +66,26 @@ class Measure:
 
 def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
     """Measure the residuals of keypoints (C, frames, 25, 3) under at least two cameras."""
-    points_m, residuals_px, _ = triangulate(cameras, keypoints)
-    judged = (keypoints[..., 2] > 0) & np.isfinite(points_m).all(-1)
-    off_px = max(float(np.hypot(*camera.size_px)) for camera in cameras)  # of a point behind a camera that sees it
-    off = np.where(np.isfinite(residuals_px), residuals_px, off_px)
-    found = {camera.name: row[use] for camera, row, use in zip(cameras, off, judged, strict=True)}
+    points_m, residuals_px = _residuals_px(cameras, keypoints)
     return Measure(
-        median_px={name: float(np.median(row)) if len(row) else off_px for name, row in found.items()},
-        p95_px={name: float(np.percentile(row, 95)) if len(row) else off_px for name, row in found.items()},
+        median_px={name: float(np.median(off_px)) for name, off_px in residuals_px.items()},
+        p95_px={name: float(np.percentile(off_px, 95)) for name, off_px in residuals_px.items()},
         cost_px=trimmed_cost_px(cameras, keypoints),
         cost_without_px=cost_without_each_px(cameras, keypoints) if len(cameras) > 2 else {},
         body_height_m=body_height_m(crossed_points(cameras, keypoints, points_m)),
         points_m=points_m,
     )
+
+
+def _residuals_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the points (frames, 25, 3) triangulated from keypoints (C, frames, 25, 3), and by camera the residuals of
+    those that it sees. The diagonal of the largest image counts for a point behind the camera, and if it sees none."""
+    points_m, residuals_px, _ = triangulate(cameras, keypoints)
+    judged = (keypoints[..., 2] > 0) & np.isfinite(points_m).all(-1)
+    diagonal_px = max(float(np.hypot(*camera.size_px)) for camera in cameras)
+    off_px = np.where(np.isfinite(residuals_px), residuals_px, diagonal_px)
+    found = (row[use] if use.any() else np.array([diagonal_px]) for row, use in zip(off_px, judged, strict=True))
+    return points_m, dict(zip([camera.name for camera in cameras], found, strict=True))
 
 
 def crossed_points(cameras: Sequence[Camera], keypoints: np.ndarray, points_m: np.ndarray) -> np.ndarray:
@@ -211,7 +218,8 @@ def undo_mistake(cameras: list[Camera], keypoints: np.ndarray, found: Measure) -
         for i in gross
         for cause, undo in (MISTAKES | SINGLE_CAMERA_MISTAKES).items()
     }
-    medians_px = {what: [*measure(repaired, keypoints).median_px.values()] for what, repaired in undone.items()}
+    residuals_px = {what: _residuals_px(repaired, keypoints)[1].values() for what, repaired in undone.items()}
+    medians_px = {what: [np.median(off_px) for off_px in rows] for what, rows in residuals_px.items()}
     costs_px = {what: np.sum(medians) for what, medians in medians_px.items() if max(medians) <= limit_px}
     if not costs_px:
         return cameras, {}

@@ -62,8 +62,9 @@ class Adjustment:
     """A robust least-squares problem over board poses, time offsets, and the cameras that are `moving`. Unknowns in one
     vector: 6 per camera, 6 per frame (rotation, then translation), 1 per image that shows the board.
 
-    Offsets are in frames of the footage; numbers of frames tell where some are missing. Rotations are updated on the
-    left, R <- exp(w) R (Triggs et al. 2000, Bundle Adjustment, section 2.2).
+    cameras: those of the corners, in their order. Offsets are in frames of the footage; numbers of frames tell where
+    some are missing. Rotations are updated on the left, R <- exp(w) R (Triggs et al. 2000, Bundle Adjustment, section
+    2.2).
     """
 
     def __init__(self, cameras: Sequence[Camera], corners: BoardCorners, boards: Poses, moving: Sequence[bool]) -> None:
