@@ -26,7 +26,7 @@ class Network:
             import onnxruntime
         except ImportError:
             raise InputError(
-                f"segmentation.model: {path}: needs ONNX Runtime; install hnerf-pipeline[learned], or leave it out"
+                f"segmentation.model: {path}: needs ONNX Runtime; install '.[learned]', or leave it out"
             ) from None
         self.path = path
         try:
