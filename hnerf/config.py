@@ -49,7 +49,7 @@ class CaptureSettings(Section):
 class SyntheticSettings(Section):
     """Settings of the synthetic capture that `hnerf synth` writes; no stage of a run reads them."""
 
-    seed: Seed = 0
+    seed: Seed = 0  # of everything random
     size_px: int = Field(default=256, ge=16, le=4096)  # side of the square images
     train_cameras: int = Field(default=4, ge=1)  # on a ring, at equal angles
     test_cameras: int = Field(default=2, ge=0)  # each half-way between two training cameras
@@ -123,7 +123,7 @@ class FieldSettings(Section):
     tunes_poses: ClassVar[bool] = False
     models_motion: ClassVar[bool] = True
     no_new_poses: ClassVar[str] = ""
-    kind: str
+    kind: str  # of field, which decides the other settings of this section
     scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge; unit of sigma_h, gamma and the root's T
 
 
@@ -157,7 +157,7 @@ class PaperFieldSettings(FieldSettings):
     box_samples: int = Field(default=0, ge=0)  # number of coarse samples that are spent on the person's box only
     rays: Literal["image", "box"] = "image"  # train on all pixels, or on those whose rays meet the person's box
     gamma: float = Field(default=200.0, gt=0)  # sharpness of the surface, per scene unit
-    learning_rate: float = Field(default=1e-3, gt=0)
+    learning_rate: float = Field(default=1e-3, gt=0)  # at the start
     root_condition: bool = True  # whether colour depends on the root transform T
     view_octaves: int = Field(default=0, ge=0)  # of the encoding of the viewing direction
     bf16: bool = False  # multiply in bfloat16 in all layers but the last
@@ -176,8 +176,8 @@ class NerfSettings(FieldSettings):
     no_new_poses: ClassVar[str] = "NeRF models one moment"
     kind: Literal["nerf"] = "nerf"
     samples: int = Field(default=24, ge=2)  # coarse samples per ray, and as many fine ones
-    width: int = Field(default=64, ge=2)
-    learning_rate: float = Field(default=5e-3, gt=0)
+    width: int = Field(default=64, ge=2)  # of the networks' layers
+    learning_rate: float = Field(default=5e-3, gt=0)  # at the start
 
 
 class IdrSettings(FieldSettings):
@@ -187,20 +187,20 @@ class IdrSettings(FieldSettings):
     no_new_poses: ClassVar[str] = "IDR models one moment"
     kind: Literal["idr"] = "idr"
     samples: int = Field(default=32, ge=3)  # per ray, to find where it is nearest to the surface
-    width: int = Field(default=64, ge=2)
-    learning_rate: float = Field(default=1e-3, gt=0)
+    width: int = Field(default=64, ge=2)  # of the networks' layers
+    learning_rate: float = Field(default=1e-3, gt=0)  # at the start
 
 
 class NeuralBodySettings(FieldSettings):
     """Settings of NeuralBody, a compared method (hnerf/baselines/neural_body.py)."""
 
     kind: Literal["neural_body"] = "neural_body"
-    samples: int = Field(default=32, ge=2)
-    voxel_m: float = Field(default=0.015, gt=0)
+    samples: int = Field(default=32, ge=2)  # per ray
+    voxel_m: float = Field(default=0.015, gt=0)  # edge of the finest voxels
     code_width: int = Field(default=16, ge=1)  # of each vertex's latent code
-    channels: int = Field(default=32, ge=1)
-    width: int = Field(default=64, ge=1)
-    learning_rate: float = Field(default=5e-3, gt=0)
+    channels: int = Field(default=32, ge=1)  # features of a voxel, at each of the coarser levels
+    width: int = Field(default=64, ge=1)  # of the density and colour networks' layers
+    learning_rate: float = Field(default=5e-3, gt=0)  # at the start
 
 
 class NerfiesSettings(FieldSettings):
@@ -210,7 +210,7 @@ class NerfiesSettings(FieldSettings):
     kind: Literal["nerfies"] = "nerfies"
     samples: int = Field(default=24, ge=2)  # coarse samples per ray, and as many fine ones
     width: int = Field(default=64, ge=2)  # of the template network's layers
-    deformation_width: int = Field(default=64, ge=2)
+    deformation_width: int = Field(default=64, ge=2)  # of the deformation network's layers
     code_width: int = Field(default=8, ge=1)  # of each frame's latent code
     anneal_share: float = Field(default=1 / 3, gt=0, le=1)  # share of training until all octaves are used
     learning_rate: float = Field(default=1e-3, gt=0)  # as published; with 5e-3, it comes apart after minutes
@@ -265,7 +265,7 @@ class TrainingSettings(Section):
     snapshots_s: tuple[PositiveFloat, ...] = ()  # times at which to save the subject, below `snapshots/`
     processes: int = Field(default=0, ge=0)  # 0: one per GPU, or one without a GPU
     memory_gib: float | None = Field(default=None, gt=0)  # per process, for the rays of a step; null: what is free
-    seed: Seed = 0
+    seed: Seed = 0  # of everything random
 
     @model_validator(mode="after")
     def _compared_methods_tune_no_poses(self) -> Self:

@@ -49,6 +49,12 @@ def test_a_line_has_key_value_type_bounds_and_comment() -> None:
     assert "shape.levels=[4, 8] list of int" in [" ".join(line.split()) for line in settings_list(Scene())]
 
 
+@pytest.mark.parametrize("preset", sorted(path.stem for path in config.CONFIGS.glob("*.yaml")))
+def test_every_setting_says_what_it_means(preset: str) -> None:
+    lines = [*settings_list(load_settings(preset)), *settings_list(SyntheticSettings())]
+    assert [line for line in lines if len(re.split(" {2,}", line)) < 3] == []
+
+
 def test_the_command_lists_a_preset(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["settings", "--preset", "paper"]) == 0
     lines = capsys.readouterr().out.splitlines()
