@@ -1,6 +1,7 @@
-"""What the Prefect server does by itself, and when it tells the operator: python -m flows.automations [--webhook URL].
+"""Set up what the Prefect server does by itself: python -m flows.automations [--webhook URL].
 
-Without a webhook only lost runs are ended. Given again, the command brings what is there up to date.
+It ends lost runs and, with a webhook, tells the operator when something is wrong. Repeat the command to update what it
+has set up.
 """
 
 import argparse
