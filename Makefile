@@ -1,5 +1,5 @@
 # make install | test | faults | soak | demo | docs
-# To use another package index, for example for CUDA wheels, set pip's environment variables.
+# Torch is the CUDA build on pip's public index; PIP_EXTRA_INDEX_URL can name another index, for example for CPU wheels.
 export DO_NOT_TRACK := 1
 
 PYTHON ?= python3
