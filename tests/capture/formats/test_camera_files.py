@@ -56,6 +56,16 @@ def to_binary(model: Path) -> None:
         path.unlink()
 
 
+def test_the_documented_example_is_a_camera_where_it_says(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "formats.md").read_text()
+    example = page.partition("## Your own calibration")[2].partition("```toml\n")[2].partition("```")[0]
+    (tmp_path / "calibration.toml").write_text(example)
+    lens = Caliscope(tmp_path).lenses()["front"]
+    assert (-lens.R.T @ lens.t_m).tolist() == pytest.approx([0, -4, 1.5], abs=1e-6)
+    assert lens.R[2].tolist() == pytest.approx([0, 1, 0], abs=1e-6)  # looks along +Y
+    assert lens.R[1].tolist() == pytest.approx([0, 0, -1], abs=1e-6)  # stands upright
+
+
 @pytest.mark.parametrize("binary", [False, True])
 def test_a_colmap_model_is_read(binary: bool, tmp_path: Path) -> None:
     lenses = Colmap(write_model(tmp_path, binary)).lenses()
