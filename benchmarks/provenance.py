@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 import hnerf
 from hnerf.study.machine import describe_machine, machine
-from hnerf.tables import head, line
+from hnerf.tables import table as table  # the programs take it from here
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -61,11 +61,6 @@ def write_result(name: str, result: dict[str, Any], markdown: str) -> None:
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
     (RESULTS / f"{name}.md").write_text(markdown)
-
-
-def table(rows: list[list[str]]) -> list[str]:
-    """Return the lines of a Markdown table; the first row is its header."""
-    return [*head(rows[0]), *map(line, rows[1:])]
 
 
 def clean_commit(root: Path) -> str:

@@ -120,7 +120,7 @@ def _split_table(captures: dict[str, Any], split: str) -> list[str]:
     rows = [["capture", "images", *(title for title, _ in columns.values())]]
     for name, figures in captures.items():
         if not figures.get("score"):
-            rows.append([name, figures.get("error", "no ground truth"), *[""] * len(columns)])
+            rows.append([name, figures.get("error", "no ground truth")])
             continue
         rows.append([name, *score_cells(figures["score"][split])])
     return table(rows)
@@ -154,7 +154,7 @@ def _holdout_table(captures: dict[str, Any]) -> list[str]:
             continue
         held_out = figures["own_metrics"]["holdout"]
         if held_out is None:
-            rows.append([name, "", figures["own_metrics"]["holdout_reason"], ""])
+            rows.append([name, "", figures["own_metrics"]["holdout_reason"]])
             continue
         for camera, found in (held_out["cameras"] | {"mean": held_out["mean"]}).items():
             rows.append([name, camera, _image_cell(found["novel_view"]), _image_cell(found["novel_pose"])])

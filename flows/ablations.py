@@ -19,7 +19,7 @@ from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, title_of, 
 from hnerf.errors import InputError, one_line
 from hnerf.files import replace_text
 from hnerf.study.benchmark import results
-from hnerf.tables import head, line, pick
+from hnerf.tables import pick, table
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.limits import set_limits
@@ -119,8 +119,7 @@ def as_markdown(result: dict[str, Any]) -> str:
     titles = ["", *(title for title, _ in COLUMNS.values()), "training, s", "on"]
     lines = [f"# Ablations of {result['subject']}, preset `{result['preset']}`{with_overrides}", ""]
     lines += [results.CELL_LEGEND, ""]
-    lines += head(titles)
-    lines += [line([name, *_cells(row)]) for name, row in result["rows"].items()]
+    lines += table([titles, *([name, *_cells(row)] for name, row in result["rows"].items())])
     if result["left_out"]:
         lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in result["left_out"].items())]
     found = [row for row in result["rows"].values() if "error" not in row]
@@ -132,6 +131,6 @@ def as_markdown(result: dict[str, Any]) -> str:
 
 def _cells(row: dict[str, Any]) -> list[str]:
     if "error" in row:
-        return [row["error"].replace("|", "/"), *[""] * (len(COLUMNS) + 1)]
+        return [row["error"]]
     scores = [results.cell(row, key, form) for key, (_, form) in COLUMNS.items()]
     return [*scores, f"{row['seconds']:.0f}", row["device"]]

@@ -16,6 +16,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, one_line
 from hnerf.evaluation.holdout import held_out_cameras
+from hnerf.tables import table
 from tasks.asset import export
 from tasks.bucket import BucketError
 from tasks.calibration import calibrate, calibrated_capture
@@ -180,8 +181,7 @@ def _key_pictures(calibration: Artifact, evaluation: Artifact) -> list[tuple[str
 
 def _figures(subject: str, evaluation: Artifact, training: Artifact, trained: Trained) -> str:
     """Format the scores, the cost, and the paths of the report and the asset."""
-    lines = [f"# {subject}", "", "| figure | value |", "|---|---|"]
-    lines += [f"| {name} | {value:.4g} |" for name, value in evaluation.metrics.items()]
-    lines += [f"| training {name} | {value:.4g} |" for name, value in training.metrics.items()]
-    lines += ["", f"Report: `{trained.report}`", f"Asset: `{trained.asset or 'none'}`"]
+    figures = evaluation.metrics | {f"training {name}": value for name, value in training.metrics.items()}
+    rows = [["figure", "value"], *([name, f"{value:.4g}"] for name, value in figures.items())]
+    lines = [f"# {subject}", "", *table(rows), "", f"Report: `{trained.report}`", f"Asset: `{trained.asset or 'none'}`"]
     return "\n".join(lines)

@@ -1,17 +1,15 @@
-"""Markdown tables: lines, and figures formatted as cells."""
+"""Markdown tables, and figures formatted as cells."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 
-def head(titles: Sequence[str]) -> list[str]:
-    """Return the first two lines of a table: its titles and the rule below them."""
-    return [line(titles), "|" + "---|" * len(titles)]
-
-
-def line(cells: Sequence[str]) -> str:
-    """Return one row of a table."""
-    return f"| {' | '.join(cells)} |"
+def table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table, whose first row is its titles. A shorter row ends with empty cells; "|" in a cell,
+    as in the message of an error, becomes "/"."""
+    full = [[cell.replace("|", "/") for cell in row] + [""] * (len(rows[0]) - len(row)) for row in rows]
+    titles, *lines = (f"| {' | '.join(cells)} |" for cells in full)
+    return [titles, "|" + "---|" * len(rows[0]), *lines]
 
 
 def shown(value: float | None, form: str) -> str:

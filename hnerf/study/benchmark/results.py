@@ -21,7 +21,7 @@ from hnerf.files import markdown_image
 from hnerf.study.benchmark.convergence import CURVE_PROTOCOL
 from hnerf.study.benchmark.curves import Point, seconds_to_reach, value_at
 from hnerf.study.machine import describe_machine
-from hnerf.tables import head, line, pick, shown
+from hnerf.tables import pick, shown, table
 
 SPLITS = {
     NOVEL_VIEW: "new views",
@@ -159,17 +159,15 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
     titles = ["method", *(t for t, _ in COLUMNS.values()), *(t for t, _ in COSTS.values())]
     titles += [f"frame at {size} px, s" for size in sizes] + [f"s to best - {NEAR_BEST_DB:g} dB"]
     near_best = near_best_seconds(variant)
-    lines = [f"{variant['cameras']} training cameras, {variant['frames']} training frames.{_counts(variant)}", ""]
-    lines += head(titles)
-    missing: dict[str, list[str]] = {}
+    rows, missing = [titles], dict[str, list[str]]()
     for name, scores in variant["methods"].items():
         if "error" in scores:
-            lines.append(line([name, scores["error"].replace("|", "/"), *[""] * (len(titles) - 2)]))
+            rows.append([name, scores["error"]])
             continue
         cells = [cell(scores, key, form) for key, (_, form) in COLUMNS.items()]
         cells += [shown(scores["training"][key], form) for key, (_, form) in COSTS.items()]
         cells += [shown(scores["frame_seconds"].get(size), "{:.2f}") for size in sizes]
-        lines.append(line([name, *cells, shown(near_best.get(name), "{:.0f}")]))
+        rows.append([name, *cells, shown(near_best.get(name), "{:.0f}")])
         for reason in missing_figures(scores):
             missing.setdefault(reason, []).append(name)
         if scores["trained_on"] != {key: variant[key] for key in scores["trained_on"]}:
@@ -178,10 +176,10 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
     for key, title in TRIVIAL_PICTURES.items() if scored_methods(variant) else ():
         known = [[v for m in scored_methods(variant).values() if (v := m[s][key]) is not None] for s in SPLITS]
         of_each = " / ".join(shown(values[0] if values else None, "{:.2f}") for values in known)
-        lines.append(line([title, of_each, *[""] * (len(titles) - 2)]))
-    lines += _timeline(variant)
+        rows.append([title, of_each])
+    taken = f"{variant['cameras']} training cameras, {variant['frames']} training frames.{_counts(variant)}"
     message = [f"- {', '.join(names)}: {reason}" for reason, names in missing.items()]
-    return [*lines, *(["", *message] if message else [])]
+    return [taken, "", *table(rows), *_timeline(variant), *(["", *message] if message else [])]
 
 
 def _counts(variant: Mapping[str, Any]) -> str:
@@ -214,17 +212,14 @@ def _timeline(variant: Mapping[str, Any]) -> list[str]:
     curves, why = psnr_curves(variant), end_reasons(variant)
     if not why:
         return []
-    lines = ["", "PSNR of the curve's images, dB; linear in the logarithm of time between trainings.", ""]
-    lines += head(["method", *AFTER_S.values(), "at its end", "best", "ended"])
+    rows = [["method", *AFTER_S.values(), "at its end", "best", "ended"]]
     for name, curve in curves.items():
         (end_s, at_end), (best_s, best) = curve[-1], max(curve, key=lambda point: point[1])
         known_s = end_s if why[name] == END_REASONS["limit"] else math.inf  # a longer training would score higher
         values = [value_at(curve, seconds) if seconds <= known_s else None for seconds in AFTER_S]
         cells = [shown(value, "{:.2f}") for value in values]
-        lines.append(
-            line([name, *cells, f"{at_end:.2f}", f"{best:.2f} ({best_s:.0f} s)", f"{end_s:.0f} s, {why[name]}"])
-        )
-    return lines
+        rows.append([name, *cells, f"{at_end:.2f}", f"{best:.2f} ({best_s:.0f} s)", f"{end_s:.0f} s, {why[name]}"])
+    return ["", "PSNR of the curve's images, dB; linear in the logarithm of time between trainings.", "", *table(rows)]
 
 
 def as_csv(result: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ from hnerf.study.stability.verdict import (
     WORST_LAST,
 )
 from hnerf.study.surface import LENGTH_RANGE, VOLUME_RANGE
-from hnerf.tables import head, line, shown
+from hnerf.tables import shown, table
 
 REFERENCE = "as recorded"
 LEGEND = (
@@ -78,12 +78,11 @@ def as_markdown(result: Row, charts: Sequence[str]) -> str:
     verdicts."""
     methods, kinds = result["plan"]["methods"], result["plan"]["degradations"]
     lines = [f"# Stability of {', '.join(methods)} on {result['subject']}: study `{result['study']}`", "", LEGEND, ""]
-    lines += ["## How far each method holds", "", *head(["degradation", *methods])]
-    for kind in kinds:
-        lines.append(line([KINDS[kind].label, *(tolerated_strength(result, method, kind) for method in methods)]))
-    lines += ["", *map(markdown_image, charts), "", "## Runs", ""]
-    lines += head(["method", "degradation", "strength", "seed", "verdict", *(title for title, _ in FIGURES.values())])
-    lines += [line(_cells(run)) for run in result["runs"]]
+    held = [[KINDS[kind].label, *(tolerated_strength(result, method, kind) for method in methods)] for kind in kinds]
+    lines += ["## How far each method holds", "", *table([["degradation", *methods], *held])]
+    titles = ["method", "degradation", "strength", "seed", "verdict", *(title for title, _ in FIGURES.values())]
+    runs = table([titles, *map(_cells, result["runs"])])
+    lines += ["", *map(markdown_image, charts), "", "## Runs", "", *runs]
     lines += ["", "## Left out", "", *(f"- {reason}" for reason in result["left_out"] or ["nothing"]), ""]
     return "\n".join([*lines, *([result["protocol"], ""] if result["protocol"] else [])])
 
@@ -93,7 +92,7 @@ def _cells(run: Row) -> list[str]:
     strength = "" if run["strength"] is None else f"{run['strength']:g}"
     verdict = f"{run['verdict']}: {run['reason']}" if run["reason"] else run["verdict"]
     scores = [_compared(run, key, digits) for key, (_, digits) in FIGURES.items()]
-    return [run["method"], kind, strength, str(run["seed"]), verdict.replace("|", "/"), *scores]
+    return [run["method"], kind, strength, str(run["seed"]), verdict, *scores]
 
 
 def _compared(run: Row, key: str, digits: int) -> str:
