@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/valid-wave.png"))
     options = parser.parse_args()
     capture = load_cameras(options.subject / "calibration", Capture.load(options.subject / "capture"))
-    fitted, avatar = BodyFit.load(options.subject / "fit"), load_avatar(options.subject / "training")
+    fitted, avatar = BodyFit.load(options.subject / "fit"), load_avatar(options.subject / "training", "cpu")
     camera, row = capture.cameras[options.camera], avatar.body.index(options.frame)
     drawn = avatar.render(camera, avatar.body.theta[row], avatar.body.root[row])
     rendered = (drawn.rgb.numpy() * 255).round().astype(np.uint8)

@@ -39,7 +39,7 @@ def main() -> None:
 
 def measure(subject: Path, cores: list[int]) -> dict[str, float]:
     """Return the median seconds, by longest side and number of threads."""
-    avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+    avatar = load_avatar(subject / "training")
     capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
     camera = capture.cameras[(*capture.test_cameras, *capture.train_cameras)[0]]
     found = {}

@@ -21,6 +21,7 @@ from provenance import RESULTS, arguments, provenance, provenance_line, table, w
 from studies import capture_folder
 
 from flows.preparation import segment_subject
+from hnerf.avatar.trained import load_avatar
 from hnerf.capture.capture import Capture
 from hnerf.config import load_settings
 from hnerf.evenly_spaced import evenly_spaced
@@ -31,7 +32,7 @@ from tasks.fit import fit
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
 from tasks.study import degrade_capture
-from tasks.training import load_trained_avatar, train
+from tasks.training import train
 
 STEPS = 60
 SHARES = (0.25, 0.5)
@@ -111,7 +112,7 @@ def measure(store: Store, recording: Artifact) -> dict[str, Cost]:
     body = timed("fit", lambda: fit(store, recording, calibration, segmentation, settings.fit))
     training = timed("training", lambda: train(store, recording, calibration, segmentation, body, settings.training))
     costs["training"] = costs["training"][0], training.metrics["peak_memory_gib"]  # training runs in a separate process
-    avatar, capture = load_trained_avatar(training), calibrated_capture(recording, calibration)
+    avatar, capture = load_avatar(training.root), calibrated_capture(recording, calibration)
     camera = capture.cameras[capture.train_cameras[0]]
     avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
     timed("one image", lambda: avatar.render(camera, avatar.body.theta[0], avatar.body.root[0]))

@@ -18,7 +18,7 @@ from hnerf.render.trajectory import interpolate_cameras
 def main(subject: Path, out: Path, pictures: int = 60, side_px: int = 256) -> None:
     """Write `pictures` square images, in which the person moves through all fitted frames."""
     capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
-    avatar = load_avatar(subject / "training")  # "cuda" as second argument for a GPU
+    avatar = load_avatar(subject / "training")
     recorded = [capture.cameras[name].resized(side_px, side_px) for name in capture.train_cameras]
     path = interpolate_cameras([*recorded, recorded[0]], pictures)
     frames = avatar.body.frames

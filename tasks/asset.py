@@ -3,13 +3,13 @@
 from pathlib import Path
 
 from hnerf.asset.export import export_asset
+from hnerf.avatar.trained import load_avatar
 from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.models import THREE_SHA256
 from tasks.calibration import calibrated_capture
 from tasks.stage import stage
 from tasks.store import Artifact
-from tasks.training import load_trained_avatar
 
 
 @stage("asset", version="28", networks=tuple(THREE_SHA256))
@@ -24,5 +24,5 @@ def export(
     """Export the trained person to USD and glTF files."""
     capture = calibrated_capture(recording, calibration)
     masks = Masks.load(segmentation.root)
-    export_asset(capture, masks, load_trained_avatar(training), settings, out, recording.digest)
+    export_asset(capture, masks, load_avatar(training.root), settings, out, recording.digest)
     return {}

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import torch
-
 from hnerf.body.fit_result import BodyFit
 from hnerf.evaluation.ground_truth import truth_of
 from hnerf.models import LPIPS_ALEXNET
@@ -49,7 +47,6 @@ def score_end_of_training(
 
 
 def scoring_scene(truth: Source, recording: Artifact, calibration: Artifact, body: Artifact) -> ScoringScene:
-    """Return what trainings on a recording are scored against, on the GPU if there is one."""
+    """Return what trainings on a recording are scored against."""
     capture = calibrated_capture(recording, calibration)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    return ScoringScene(capture, BodyFit.load(body.root), truth_of(truth.root, capture), device)
+    return ScoringScene(capture, BodyFit.load(body.root), truth_of(truth.root, capture))

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.masks import Masks
 from hnerf.config import EvaluationSettings
@@ -16,7 +17,6 @@ from tasks.calibration import calibrated_capture
 from tasks.source import Source, require_unchanged
 from tasks.stage import stage
 from tasks.store import Artifact
-from tasks.training import load_trained_avatar
 
 
 @stage("evaluation", version="19", networks=(LPIPS_ALEXNET,))
@@ -38,7 +38,7 @@ def evaluate(
         capture=calibrated_capture(recording, calibration),
         masks=Masks.load(segmentation.root),
         fitted=BodyFit.load(body.root),
-        avatar=load_trained_avatar(training),
+        avatar=load_avatar(training.root),
         calibration_folder=calibration.root,
         segmentation_folder=segmentation.root,
         fit_folder=body.root,
@@ -66,7 +66,7 @@ def evaluate_held_out(
     """Score an avatar on a camera, under its own masks. Recording, calibration and segmentation include that camera;
     body and training were made without it."""
     capture, masks = calibrated_capture(recording, calibration), Masks.load(segmentation.root)
-    avatar, fitted = load_trained_avatar(training), BodyFit.load(body.root)
+    avatar, fitted = load_avatar(training.root), BodyFit.load(body.root)
     return _headline(score_held_out(capture, masks, avatar, fitted, training.root, camera, settings, out))
 
 

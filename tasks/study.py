@@ -7,6 +7,7 @@ from pathlib import Path
 
 import trimesh
 
+from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
@@ -18,7 +19,6 @@ from tasks.calibration import calibrated_capture
 from tasks.source import Source, require_unchanged
 from tasks.stage import stage
 from tasks.store import Artifact
-from tasks.training import load_trained_avatar
 
 EXTREME_POSES = 3  # checked for each strength and seed
 
@@ -75,7 +75,7 @@ def check_meshes(out: Path, report: Artifact, body: Artifact) -> dict[str, float
 @stage("study-poses", version="1")
 def show_in_extreme_poses(out: Path, training: Artifact, degradation: Degradation) -> dict[str, float]:
     """Check the surface of a trained person in poses far from the recorded ones, and write `surface.json`."""
-    avatar = load_trained_avatar(training)
+    avatar = load_avatar(training.root)
     poses = extreme_poses(avatar.body, degradation.strength, EXTREME_POSES, degradation.rng)
     return _save({f"pose {k}": check_pose(avatar, *pose) for k, pose in enumerate(zip(*poses, strict=True))}, out)
 

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import torch
 
-from hnerf.avatar.avatar import Avatar
-from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings
 from hnerf.errors import PlaceError
 from hnerf.training.checkpoint import NAME
@@ -36,8 +34,3 @@ def train(
     run_ranks("hnerf.training.run", [*inputs, settings.model_dump_json(), str(out)], processes)
     report = json.loads((out / "report.json").read_text())
     return {name: report[name] for name in ("steps", "seconds", "peak_memory_gib", "model_mib")}
-
-
-def load_trained_avatar(training: Artifact) -> Avatar:
-    """Load the trained person, on the GPU if there is one."""
-    return load_avatar(training.root, "cuda" if torch.cuda.is_available() else "cpu")

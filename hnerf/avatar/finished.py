@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
-import torch
 from safetensors import SafetensorError
 
 from hnerf.avatar.trained import TrainedAvatar, load_avatar
@@ -51,7 +50,7 @@ def recording_of(subject: Path) -> Capture:
 def avatar_of(subject: Path) -> TrainedAvatar:
     """Load a subject's trained avatar, onto the GPU if there is one."""
     with readable(subject / "training"):
-        return load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+        return load_avatar(subject / "training")
 
 
 def reason_without_novel_poses(training: Path) -> str | None:

@@ -141,8 +141,10 @@ class TrainedAvatar:
         return same[apart.argmin(keepdim=True)] if len(same) else torch.full((1,), -1, device=theta.device)
 
 
-def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
-    """Load the subject that training left in `folder`. Raises InputError if another version wrote it."""
+def load_avatar(folder: Path, device: torch.device | str | None = None) -> TrainedAvatar:
+    """Load the subject that training left in `folder`, onto the GPU if there is one and no other device is named.
+    Raises InputError if another version wrote it."""
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     settings, static, gains = _stored_settings(folder / "settings.json")
     body = BodyFit.load(folder).to(device)
     path = folder / "model.safetensors"

@@ -62,7 +62,7 @@ def test_both_networks_of_the_paper_use_the_bf16_setting(tmp_path: Path, bf16: b
 def test_ray_batches_are_limited_by_their_number_of_samples(subject: Path, monkeypatch: pytest.MonkeyPatch):
     """Rays have eight samples, and a batch may have 2048 samples."""
     capture, _, body = record(subject / "capture")
-    avatar, at_once = load_avatar(subject), []
+    avatar, at_once = load_avatar(subject, "cpu"), []
     look = avatar.field.render_rays
 
     def counted(scene: PosedScene[object], rays: Rays) -> Tensor:

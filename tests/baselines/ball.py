@@ -61,7 +61,7 @@ def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) 
     capture = dataclasses.replace(capture, train_cameras=cameras)
     (folder / "out").mkdir()
     train(capture, masks, fit, settings, folder / "out", ALONE)
-    return load_avatar(folder / "out")
+    return load_avatar(folder / "out", "cpu")
 
 
 def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:

@@ -42,7 +42,7 @@ def learn(folder: Path, settings: TrainingSettings, bends_rad: tuple[float, floa
     capture, masks, body = record(folder / "capture", bends_rad)
     (folder / "out").mkdir()
     train(capture, masks, body, settings, folder / "out", ALONE)
-    return Learned(capture, body, load_avatar(folder / "out"))
+    return Learned(capture, body, load_avatar(folder / "out", "cpu"))
 
 
 def three_poses() -> BodyFit:

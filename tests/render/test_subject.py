@@ -75,7 +75,7 @@ def numbers(out: Path, kind: str) -> list[str]:
 def test_a_recorded_camera_shows_every_fitted_frame(subject: Path, tmp_path: Path) -> None:
     assert main(["render", str(subject), "--camera", "2", "--out", str(tmp_path / "out"), "--what", "colour,mask"]) == 0
     assert numbers(tmp_path / "out", "mask") == ["000000", "000001", "000002"]
-    avatar = load_avatar(subject / "training")
+    avatar = load_avatar(subject / "training", "cpu")
     camera = Capture.load(subject / "capture").cameras["2"]
     for row in range(3):
         rgb = avatar.render(camera, avatar.body.theta[row], avatar.body.root[row]).rgb
@@ -95,7 +95,7 @@ def test_a_recorded_frame_keeps_its_deformation_and_interpolated_poses_have_none
     for name, options in arguments.items():
         view = ["--camera", "0", "--what", "colour", *options]
         assert main(["render", str(subject), "--out", str(tmp_path / name), *view]) == 0
-    avatar = load_avatar(subject / "training")
+    avatar = load_avatar(subject / "training", "cpu")
     camera = Capture.load(subject / "capture").cameras["0"]
     halfway = interpolate_poses(avatar.body, 1, 2, 3)
     expected = {

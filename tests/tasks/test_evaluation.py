@@ -28,7 +28,7 @@ def test_scores_are_stored_only_if_the_ground_truth_is_unchanged(
     for name, fake in {
         "evaluate_avatar": evaluate_avatar,
         "calibrated_capture": lambda *_: None,
-        "load_trained_avatar": lambda *_: None,
+        "load_avatar": lambda *_: None,
         "Masks": SimpleNamespace(load=lambda _: None),
         "BodyFit": SimpleNamespace(load=lambda _: None),
     }.items():

@@ -50,7 +50,7 @@ def test_an_interrupted_training_ends_like_an_uninterrupted_one(
 
     one, two = (load_file(folder / "model.safetensors") for folder in (whole, parts))
     assert all(torch.equal(one[name], two[name]) for name in one)
-    bodies = [load_avatar(folder).body for folder in (whole, parts)]
+    bodies = [load_avatar(folder, "cpu").body for folder in (whole, parts)]
     assert torch.equal(bodies[0].theta, bodies[1].theta)
     losses = [
         [json.loads(row)["losses"] for row in (f / "history.jsonl").read_text().splitlines()] for f in (whole, parts)
@@ -82,7 +82,7 @@ def test_a_field_can_overfit_the_column(tmp_path: Path):
     out.mkdir()
     rare = {"absorb_steps": 60, "checkpoint_steps": 120}
     train(capture, masks, body, tiny(field=fast, steps=120, rays_per_frame=256, **rare), out, ALONE)
-    avatar = load_avatar(out)
+    avatar = load_avatar(out, "cpu")
     drawn = avatar.render(capture.cameras["0"], avatar.body.theta[0], avatar.body.root[0])
     mask = torch.from_numpy(masks.get("0", 0))
     wanted = torch.from_numpy(capture.image("0", 0)) / 255 * mask[..., None]
@@ -118,7 +118,7 @@ def test_a_model_loads_after_the_shape_has_changed(tmp_path: Path):
     with torch.no_grad():
         trainer.objective.correction.shape += 0.2  # 20 cm taller
     trainer.run()
-    avatar = load_avatar(tmp_path)
+    avatar = load_avatar(tmp_path, "cpu")
     assert avatar.body.rig.vertices_m[:, 2].max().item() == pytest.approx(2.2, abs=0.02)
     for (name, loaded), learned in zip(avatar.field.named_parameters(), trainer.field.parameters(), strict=True):
         within = learned.abs().max().item() / 253 if name.endswith("features") else 0.0  # half a step of a stored grid
@@ -149,7 +149,7 @@ def test_a_time_limit_ends_the_field_and_lowers_learning_rates(tmp_path: Path, m
 def test_a_snapshot_can_be_loaded_and_rendered(tmp_path: Path):
     capture, masks, body = record(tmp_path / "capture")
     Trainer(capture, masks, body, tiny(snapshots_s=[1e-6], steps=2, novel_pose_steps=0), tmp_path, ALONE).run()
-    early, late = load_avatar(tmp_path / "snapshots" / "1e-06"), load_avatar(tmp_path)
+    early, late = load_avatar(tmp_path / "snapshots" / "1e-06", "cpu"), load_avatar(tmp_path, "cpu")
     assert early.field.log_sharpness != late.field.log_sharpness
     assert early.render(capture.cameras["0"], early.body.theta[0], early.body.root[0]).alpha.max() > 0.5
 
@@ -185,7 +185,7 @@ def test_novel_poses_never_train_the_field(tmp_path: Path):
     assert all(torch.equal(models[0][name], models[1][name]) for name in models[0])
     assert torch.equal(deformations[0][[0, 1, 3]], deformations[1][[0, 1, 3]])
     assert (deformations[0][2] != deformations[1][2]).any()
-    poses = [load_avatar(tmp_path / f"{steps}").body.theta for steps in (0, 4)]
+    poses = [load_avatar(tmp_path / f"{steps}", "cpu").body.theta for steps in (0, 4)]
     torch.testing.assert_close(poses[0][:2], poses[1][:2], atol=1e-6, rtol=0)
     assert (poses[0][2] - poses[1][2]).abs().max() > 2e-5
 
@@ -199,7 +199,7 @@ def test_training_poses_do_not_change_while_novel_poses_are_fitted(tmp_path: Pat
         out = tmp_path / f"{steps}"
         out.mkdir()
         train(*recording, settings, out, ALONE)
-        bodies.append(load_avatar(out).body)
+        bodies.append(load_avatar(out, "cpu").body)
     torch.testing.assert_close(bodies[0].theta[:2], bodies[1].theta[:2], atol=1e-6, rtol=0)
     torch.testing.assert_close(bodies[0].root[:2], bodies[1].root[:2], atol=1e-6, rtol=0)
 
@@ -210,7 +210,7 @@ def test_training_frames_with_one_posture_keep_one(tmp_path: Path):
     rows = [body.index(frame) for frame in capture.train_frames]
     body.theta[rows] = body.theta[rows].mean(0)
     train(capture, masks, body, tiny(one_posture=True, novel_pose_steps=4), tmp_path, ALONE)
-    tuned = load_avatar(tmp_path).body
+    tuned = load_avatar(tmp_path, "cpu").body
     turn = tuned.theta - body.theta
     assert turn[rows].abs().max() > 1e-4
     torch.testing.assert_close(tuned.theta[rows], tuned.theta[rows[:1]].expand(len(rows), -1, -1), atol=1e-6, rtol=0)
@@ -246,7 +246,7 @@ def test_with_a_single_training_frame_there_is_no_deformation(tmp_path: Path):
     capture, masks, body = record(tmp_path / "capture")
     train(replace(capture, train_frames=FRAMES[:1]), masks, body, tiny(novel_pose_steps=8), tmp_path, ALONE)
     assert not any("deformation" in name for name in load_file(tmp_path / "model.safetensors"))
-    assert (load_avatar(tmp_path).body.theta[2] - body.theta[2]).abs().max() > 2e-5
+    assert (load_avatar(tmp_path, "cpu").body.theta[2] - body.theta[2]).abs().max() > 2e-5
 
 
 def test_nan_losses_stop_the_run_with_their_cause(

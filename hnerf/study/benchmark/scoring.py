@@ -52,7 +52,6 @@ class ScoringScene:
     capture: Capture
     fitted: BodyFit
     truth: GroundTruth
-    device: str
 
 
 def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> Scores:
@@ -60,7 +59,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
 
     training: the training's folder. A score that is not available is null, with a reason next to it.
     """
-    avatar, split = load_avatar(training, scene.device), settings.split
+    avatar, split = load_avatar(training), settings.split
     unavailable = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
     protocol = f"{protocol_of(scene.truth)} {SCORING_PROTOCOL}"
     found: Any = {"machine": machine(), "protocol": protocol, "lpips": lpips_availability()}
@@ -88,7 +87,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
 
 def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> EndScores:
     """Write `scores.json` with the training's report and only the last point of its curve; return its content."""
-    avatar, split = load_avatar(training, scene.device), settings.split
+    avatar, split = load_avatar(training), settings.split
     scored = scene.capture.test_cameras and not reason_unavailable(split, training)
     rows = curve(scene, split, training, avatar, settings, out) if scored else []
     found = EndScores(training=json.loads((training / "report.json").read_text()), curve=rows[-1:])
@@ -102,7 +101,7 @@ def curve(
     """Return training seconds and scores of every snapshot and, last, of the finished field, in order of time."""
     end_s = json.loads((training / "report.json").read_text())["field_seconds"]
     taken = {json.loads((f / "settings.json").read_text())["seconds"]: f for f in (training / "snapshots").glob("*")}
-    models = [(s, load_avatar(taken[s], scene.device)) for s in sorted(taken) if s < end_s]
+    models = [(s, load_avatar(taken[s])) for s in sorted(taken) if s < end_s]
     rows: list[CurvePoint] = []
     for seconds, avatar in [*models, (end_s, finished)]:
         folder = out / "snapshots" / f"{seconds:g}"

@@ -68,14 +68,14 @@ def scored(
     out = base / "out"
     out.mkdir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scoring, "load_avatar", lambda path, device: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
+        patch.setattr(scoring, "load_avatar", lambda path: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
         patch.setattr("hnerf.avatar.surface.POSED_CELLS", 96)  # enough for a ball
         return score(scene(capture), training, settings, out)
 
 
 def scene(capture: Capture) -> ScoringScene:
     """Return the scene that the ball is scored against."""
-    return ScoringScene(capture, ball_fit(), GroundTruth(capture.root, capture), "cpu")
+    return ScoringScene(capture, ball_fit(), GroundTruth(capture.root, capture))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_only_the_end_of_a_longer_training_is_scored(base: Path, found: dict[str
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M + GAP_M)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scoring, "load_avatar", lambda path, device: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
+        patch.setattr(scoring, "load_avatar", lambda path: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
         end = score_end(scene(capture), base / "training", SETTINGS, tmp_path)
     assert end == {"training": found["training"], "curve": found["curve"][-1:]}
     assert json.loads((tmp_path / "scores.json").read_text()) == end
