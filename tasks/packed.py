@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 
 from hnerf.config import Section, validated
 from hnerf.errors import InputError, PlaceError
-from tasks.store import NAME, Artifact, SizeBytes, Store, remove
+from tasks.store import NAME, Artifact, Store, StoredFile, remove
 
 MANIFEST = re.compile(r"[0-9a-f]{64}\.json")
 MAX_MANIFEST_BYTES = 64 << 20  # 200 bytes a file
@@ -36,17 +36,10 @@ class NoRoomError(PlaceError):
     """The files would fill the disk."""
 
 
-class ArchivedFile(Section):
-    """The digest and size of a file."""
-
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-    size_bytes: SizeBytes
-
-
 class ArchivedArtifact(Section):
     """An artifact's record. files: by their path in its folder."""
 
-    files: dict[str, ArchivedFile]
+    files: dict[str, StoredFile]
     metrics: dict[str, float] = Field(default_factory=dict)
     inputs: tuple[Name, ...] = ()
 

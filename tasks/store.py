@@ -49,14 +49,13 @@ STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit",
 OPTIONAL = {"detection", "hands"}  # stages that a run may skip
 
 NAME = re.compile(r"[a-z][a-z-]{0,30}/[0-9a-f]{32}")  # of an artifact
-SizeBytes = Annotated[int, Field(ge=0, lt=2**63)]  # of a file
 
 
 class StoredFile(BaseModel):
     """The digest and the size with which a file of an artifact is checked."""
 
-    sha256: str
-    size_bytes: SizeBytes
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    size_bytes: Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class Artifact(BaseModel):

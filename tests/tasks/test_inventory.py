@@ -47,6 +47,7 @@ def test_an_artifact_without_a_link_belongs_to_the_subject_of_its_recording(stor
         None,
         {"files": {"deep/letters": {"sha256": "0" * 64, "size_bytes": 10**400}}},
         {"files": {"deep/letters": {"sha256": "0" * 64, "size_bytes": -1}}},
+        {"files": {"deep/letters": {"sha256": "../" * 20, "size_bytes": 3}}},
         {"inputs": ["../../x"]},
         {"metrics": {"psnr": float("nan")}},
     ],

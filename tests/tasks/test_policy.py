@@ -20,8 +20,8 @@ from tasks.source import Source
 from tasks.store import Artifact, StoredFile
 
 
-def artifact(sha256: str = "a", root: str = "/store/fit/k") -> Artifact:
-    return Artifact(stage="fit", root=Path(root), files={"f": StoredFile(sha256=sha256, size_bytes=1)}, metrics={})
+def artifact(digit: str = "a", root: str = "/store/fit/k") -> Artifact:
+    return Artifact(stage="fit", root=Path(root), files={"f": StoredFile(sha256=64 * digit, size_bytes=1)}, metrics={})
 
 
 def source(digest: str = "d", name: str = "ada", root: str = "/here/ada") -> Source:
