@@ -11,6 +11,7 @@ import multiprocessing
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,13 @@ import numpy as np
 from peak_memory import peak_mib
 from provenance import SHARED, arguments, log_progress, provenance, provenance_line, table, write_result
 
-from hnerf.capture.capture import PERSON, Capture, read_rgb
+from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.subject import ranked_people
 from hnerf.capture.subset import subset
 from hnerf.config import CaptureSettings, DetectionSettings
 from hnerf.detection.detect import detect, find_in_camera
+from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.triangulation import triangulate
 
@@ -114,20 +116,13 @@ def score_truth(folder: Path, capture: Capture) -> dict[str, Any]:
     keypoints = limb_keypoints(capture)
     errors_px = np.where(keypoints[..., 2] > 0, np.linalg.norm(keypoints[..., :2] - true_px, axis=-1), np.nan)
     found = _percentiles(errors_px, keypoints)
-    if (capture.root / PERSON).is_dir():
-        found["mask_iou"] = round(float(np.mean(list(_ious(folder, capture)))), 4)
-    return found
-
-
-def _ious(folder: Path, capture: Capture) -> list[float]:
-    ious = []
-    for camera in capture.train_cameras:
-        for frame in capture.frames:
-            name = Path(camera) / f"{frame:06d}.png"
-            places = capture.root / PERSON, folder / "ground_truth" / "masks"
-            mask, true = (read_rgb(place / name)[..., 0] > 127 for place in places)
+    truth, ious = GroundTruth(folder, capture), []
+    for view in product(capture.train_cameras, capture.frames):
+        likely = capture.person_probability(*view)
+        if likely is not None:
+            mask, true = likely > 0.5, truth.mask(*view)
             ious.append(float(np.sum(mask & true) / np.sum(mask | true)))
-    return ious
+    return found | ({"mask_iou": round(float(np.mean(ious)), 4)} if ious else {})
 
 
 def _percentiles(distances_px: np.ndarray, keypoints: np.ndarray) -> dict[str, Any]:

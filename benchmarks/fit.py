@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 from provenance import SHARED, provenance, provenance_line, store_and_captures, table, write_result
-from segmentation import true_mask
 
 from flows.preparation import prepare_training, with_detections
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import joint_transforms
 from hnerf.config import load_settings
+from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.geometry.silhouette import silhouette
 from tasks.calibration import calibrated_capture
 from tasks.capture import ingest
@@ -63,11 +63,11 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     recording, calibration, _, made = prepare_training(store, recording, settings)
     capture, fit = calibrated_capture(recording, calibration), BodyFit.load(made.root)
-    joints = joint_errors(made, folder)
+    joints, truth = joint_errors(made, folder), GroundTruth(folder, capture)
     ious, outside = [], []
     for frame, vertices_m in zip(fit.frames, fit.vertices_m().numpy(), strict=True):
         for name in capture.train_cameras:
-            mask = true_mask(folder, name, frame)
+            mask = truth.mask(name, frame)
             body = silhouette(capture.cameras[name], vertices_m, fit.rig.faces.numpy())
             ious.append((body & mask).sum() / (body | mask).sum())
             outside.append((body & ~mask).sum() / mask.sum())

@@ -24,6 +24,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.masks import Masks, movement_px
 from hnerf.config import CaptureSettings, FitSettings, SegmentationSettings
+from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.segmentation.prior import bounding_window
 from hnerf.segmentation.segment import segment
 
@@ -64,17 +65,18 @@ def measure(folder: Path, sheet: Path | None) -> dict[str, Any]:
         found = {"clean plate": [_timed_segment(capture, None)]}
         shutil.rmtree(capture.root / "background")
         found["no plate"] = _rounds(capture)
+        truth = GroundTruth(folder, capture)
         figures: dict[str, Any] = {"size_px": list(capture.cameras[capture.train_cameras[0]].size_px)}
         for kind, rounds in found.items():
             masks = rounds[-1][0]
-            figures[kind] = score(folder, capture, masks) | {
+            figures[kind] = score(truth, masks) | {
                 "ms_per_frame": round(rounds[-1][1], 1),
-                "rounds": [round(float(np.mean(list(ious(folder, capture, m).values()))), 4) for m, _ in rounds],
+                "rounds": [round(float(np.mean(list(ious(truth, m).values()))), 4) for m, _ in rounds],
                 "moved_px": [round(movement_px(a[0], b[0]), 2) for a, b in itertools.pairwise(rounds)],
             }
             if sheet:
                 sheet.mkdir(parents=True, exist_ok=True)
-                picture = worst_frames(folder, capture, masks)
+                picture = worst_frames(truth, masks)
                 cv2.imwrite(str(sheet / f"{folder.name}-{kind.replace(' ', '-')}.png"), picture[..., ::-1])
     return figures
 
@@ -97,22 +99,22 @@ def _rounds(capture: Capture) -> list[tuple[Masks, float]]:
     return rounds
 
 
-def ious(folder: Path, capture: Capture, masks: Masks) -> dict[tuple[str, int], float]:
+def ious(truth: GroundTruth, masks: Masks) -> dict[tuple[str, int], float]:
     """Return the IoU of each training camera and frame."""
     found = {}
-    for view in ((camera, frame) for camera in capture.train_cameras for frame in capture.frames):
-        true = true_mask(folder, *view)
+    for view in itertools.product(truth.capture.train_cameras, truth.capture.frames):
+        true = truth.mask(*view)
         mask = masks.get(*view) if view in masks else np.zeros_like(true)
         found[view] = float((mask & true).sum() / (mask | true).sum())
     return found
 
 
-def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
+def score(truth: GroundTruth, masks: Masks) -> dict[str, Any]:
     """Return the mean and the worst IoU, and the false and missing pixels as shares of the person's area."""
-    by_view = ious(folder, capture, masks)
+    by_view = ious(truth, masks)
     wrong = []
     for view in masks.encoded:
-        mask, true = masks.get(*view), true_mask(folder, *view)
+        mask, true = masks.get(*view), truth.mask(*view)
         wrong.append([(mask & ~true).sum() / true.sum(), (true & ~mask).sum() / true.sum()])
     values = list(by_view.values())
     return {
@@ -124,20 +126,13 @@ def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
     }
 
 
-def true_mask(folder: Path, camera: str, frame: int) -> np.ndarray:
-    """Return the true mask, (H, W) bool: True where the ray through the pixel's centre hits the person."""
-    image = cv2.imread(str(folder / "ground_truth" / "masks" / camera / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE)
-    assert image is not None, f"{folder}: no true mask of camera {camera}, frame {frame}"
-    return image > 127
-
-
-def worst_frames(folder: Path, capture: Capture, masks: Masks) -> np.ndarray:
+def worst_frames(truth: GroundTruth, masks: Masks) -> np.ndarray:
     """Return the worst frames, cropped to the person, side by side, (H, W, 3) uint8 RGB."""
-    by_view = ious(folder, capture, masks)
+    by_view = ious(truth, masks)
     cells = []
     for view in sorted(masks.encoded, key=lambda view: by_view[view])[:SHEET_FRAMES]:
-        mask, true = masks.get(*view), true_mask(folder, *view)
-        picture = (0.6 * capture.image(*view)).astype(np.uint8)
+        mask, true = masks.get(*view), truth.mask(*view)
+        picture = (0.6 * truth.capture.image(*view)).astype(np.uint8)
         picture[mask & ~true], picture[true & ~mask] = (255, 0, 0), (0, 255, 255)
         cell = picture[bounding_window(mask | true)]
         cells.append(cv2.resize(cell, None, fx=500 / len(cell), fy=500 / len(cell), interpolation=cv2.INTER_NEAREST))
