@@ -1,4 +1,5 @@
-"""Progress of long work: log records at DEBUG level, which a display draws and which are otherwise hidden."""
+"""Progress of long work, as log records at DEBUG level, which a display draws and which are otherwise hidden; and how
+long its steps take."""
 
 import json
 import logging
@@ -52,6 +53,15 @@ def tracked(items: Iterable[T], what: str, count: int) -> Iterator[T]:
             yield item
     finally:
         report(what, count, count)
+
+
+@contextmanager
+def timed(step: str, seconds: dict[str, float], logger: logging.Logger) -> Iterator[None]:
+    """Log the seconds that a step takes, and store them under its name."""
+    started_s = time.perf_counter()
+    yield
+    seconds[step] = round(time.perf_counter() - started_s, 3)
+    logger.info("%s: %.1f s", step, seconds[step])
 
 
 def relay() -> None:

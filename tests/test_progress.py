@@ -41,3 +41,14 @@ def test_progress_of_another_process_is_relayed(
 def test_text_of_another_process_on_the_line_is_dropped(reported: pytest.LogCaptureFixture) -> None:
     assert progress.report_relayed(progress.RECORD_SEPARATOR + '["training", 1, 4]INFO: created')
     assert [record.progress for record in reported.records] == [("training", 1, 4)]
+
+
+def test_the_seconds_of_a_step_are_logged_and_stored(
+    reported: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress.time, "perf_counter", iter((1.0, 3.25)).__next__)
+    seconds = {"mesh": 1.0}
+    with progress.timed("texture", seconds, progress.log):
+        pass
+    assert seconds == {"mesh": 1.0, "texture": 2.25}
+    assert reported.messages == ["texture: 2.2 s"]

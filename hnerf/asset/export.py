@@ -3,9 +3,7 @@
 import dataclasses
 import json
 import logging
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +37,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
+from hnerf.progress import timed
 from hnerf.render.motion import Motion, retarget, select_poses
 
 SPLATS = "avatar_splats.usdc"
@@ -112,15 +111,15 @@ def export_asset(
     captured = others[0] if others else None
     surface, staged, splats = asset.surface, asset.staged, asset.splats
     seconds |= asset.seconds
-    with _timed("poses", seconds):
+    with timed("poses", seconds, log):
         poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
-    with _timed("files", seconds):
+    with timed("files", seconds, log):
         info = AssetInfo(capture.name, settings.version, settings.licence, digest)
         avatars = {"registered": staged, "captured": captured.staged} if captured else {"": staged}
         write_files(out, avatars, capture, info, splats)
-    with _timed("viewer", seconds):
+    with timed("viewer", seconds, log):
         viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
-    with _timed("validation", seconds):
+    with timed("validation", seconds, log):
         resampled = [f"avatar_{rate}.usda" for rate in staged.rates]
         packages = ["avatar.usdz", "avatar.usda", *resampled, "avatar_cache.usdz", *([SPLATS] if splats else [])]
         validation = {name: validate_package(out / name) for name in packages}
@@ -146,13 +145,13 @@ def export_asset(
 def _rest_meshes(avatar: Avatar, settings: AssetSettings, seconds: dict[str, float]) -> RestMeshes:
     """Mesh the avatar in the rest pose. seconds: receives the time of each step."""
     timeless = avatar.without_frames()  # one mesh serves all frames
-    with _timed("surface", seconds):
+    with timed("surface", seconds, log):
         rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
         dense = surface_in_pose(timeless, *rest, settings.grid_cells)
-    with _timed("mesh", seconds):
+    with timed("mesh", seconds, log):
         rig = timeless.body.rig.to("cpu")
         meshes = {"registered": registered_mesh(rig, dense), "captured": captured_mesh(rig, dense, settings.faces)}
-    with _timed("distances", seconds):
+    with timed("distances", seconds, log):
         return RestMeshes(dense, meshes, surface_distances_mm(dense, meshes))
 
 
@@ -169,17 +168,17 @@ def _mesh_asset(
     below. added: further motions of the unclothed body with their frame rates, by name."""
     seconds: dict[str, float] = {}
     timeless = avatar.without_frames()  # one texture serves all frames
-    with _timed("correctives", seconds):
+    with timed("correctives", seconds, log):
         surface = _clothed_surface(capture, avatar, meshes.by_topology[topology], settings)
     layout = surface.mesh.layout(settings.texture_px)
-    with _timed("texture", seconds):
+    with timed("texture", seconds, log):
         texture, albedo = baked_textures(
             capture, timeless, surface.body, surface.surfaces_m, layout, settings, surface.mesh.cavities
         )
-    with _timed("normal map", seconds):
+    with timed("normal map", seconds, log):
         px = settings.normal_map_px
         normals = normal_map(timeless, surface.mesh, layout, px) if px else None
-    with _timed("staging", seconds):
+    with timed("staging", seconds, log):
         staged = stage_avatar(
             surface.body,
             surface.surfaces_m,
@@ -197,7 +196,7 @@ def _mesh_asset(
             surface.mesh.physiques_m,
         )
     splats = surface_splats(staged, settings.splats) if settings.splats else None
-    with _timed("comparison", seconds):
+    with timed("comparison", seconds, log):
         compared = compare_with_field(capture, masks, avatar, staged, splats)
         against_field = comparison_figures(compared)
     require_close(capture.name, topology, against_field, settings.allow_poor)
@@ -273,11 +272,3 @@ def write_files(out: Path, avatars: Avatars, capture: Capture, info: AssetInfo, 
     if splats:
         write_splats(out / SPLATS, staged, splats, capture.fps, info)
         write_splat_ply(out / "avatar_splats.ply", staged, splats)
-
-
-@contextmanager
-def _timed(step: str, seconds: dict[str, float]) -> Iterator[None]:
-    log.info("asset: %s", step)
-    start_s = time.perf_counter()
-    yield
-    seconds[step] = round(time.perf_counter() - start_s, 3)

@@ -3,9 +3,6 @@ outlines."""
 
 import logging
 import math
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -38,6 +35,7 @@ from hnerf.capture.timing import median_step, nearest_rows
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from hnerf.geometry.silhouette import silhouette
+from hnerf.progress import timed
 from hnerf.results import FitReport
 
 log = logging.getLogger("hnerf.fit")
@@ -84,33 +82,33 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         on_ground = single and is_ground(*seen, capture.up, capture.stature_m)
         terms |= {"balance": Balance(up)} if single else {}
         terms |= {"ground": Ground(up)} if on_ground else {}
-        with _timed(seconds, "start"):
+        with timed("start", seconds, log):
             pose = given_pose or initial_pose(capture, observations, model)
         palm = PalmTerm(hands) if hands and has_fingers(pose.rig) else None
         if not single:
-            with _timed(seconds, "keypoints in space"):
+            with timed("keypoints in space", seconds, log):
                 problem = make_problem(
                     model, pose, observations, smoothness, settings, offsets=TIGHT_STD, proportions=TIGHT_STD
                 )
                 pose = levenberg_marquardt(problem, pose, problem.space_term, KEYPOINT_STEPS)
-        with _timed(seconds, "keypoints in images"):
+        with timed("keypoints in images", seconds, log):
             problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=TIGHT_STD)
             problem = replace(problem, **terms)
             pose, posture_prior = _fit_in_images(capture, problem, pose, palm)
         if palm:
-            with _timed(seconds, "fingers"):
+            with timed("fingers", seconds, log):
                 pose = fit_fingers(pose, palm.views, problem.scale_m, runs(capture), step_s)
         if masks is not None:
-            with _timed(seconds, "outlines"):
+            with timed("outlines", seconds, log):
                 problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
                 terms |= {"ground": Ground(up, each_foot=True)} if on_ground else {}
                 problem = replace(problem, palm=palm, posture_prior=posture_prior, **terms)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 pose = refine_with_outlines(problem, pose, edges, settings, up if on_ground else None, threads)
-            with _timed(seconds, "clothes"):
+            with timed("clothes", seconds, log):
                 pose = refine_with_clothing(problem, pose, edges, threads)
         if palm and masks is not None:
-            with _timed(seconds, "fingers again"):
+            with timed("fingers again", seconds, log):
                 pose = fit_fingers(pose, palm.views, problem.scale_m, runs(capture), step_s)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
         report = _report(capture, masks, observations, pose, fit, seconds)
@@ -304,12 +302,3 @@ def _silhouette_iou(capture: Capture, masks: Masks, fit: BodyFit) -> list[float 
             values.append((covered & mask).sum() / max((covered | mask).sum(), 1))
         means.append(round(float(np.mean(values)), 4) if values else None)
     return means
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Log and store the seconds that a stage takes."""
-    began = time.monotonic()
-    yield
-    seconds[stage] = round(time.monotonic() - began, 2)
-    log.info("%s: %.1f s", stage, seconds[stage])
