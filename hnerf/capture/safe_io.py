@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from hnerf.errors import InputError, raise_if_unreachable
+from hnerf.errors import InputError, one_line, raise_if_unreachable
 
 MAX_IMAGE_PIXELS = 36_000_000  # a frame of 8K video has 33 million
 MAX_SIDE_PX = 32_766  # of images that OpenCV can undistort
@@ -277,7 +277,7 @@ def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.
         raise InputError(f"{path}: image missing; add it to the capture folder") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise_if_unreachable(error)
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        reason = getattr(error, "strerror", None) or one_line(error)
         raise InputError(f"{path}: not a readable image ({reason}); export it again as JPEG or PNG") from None
 
 

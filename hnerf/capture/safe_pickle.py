@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse
 
 from hnerf.capture.safe_io import read_bytes
-from hnerf.errors import InputError
+from hnerf.errors import InputError, one_line
 
 MAX_CHARACTER = 0x10FFFF
 MAX_ITEMS = 10_000_000  # of lists; numbers in arrays do not count
@@ -56,8 +56,7 @@ def _plain_data(path: Path, stream: io.BytesIO) -> Any:
             raise pickle.UnpicklingError(f"more than {MAX_ITEMS} items")
         return plain
     except Exception as error:  # a damaged pickle can raise nearly anything
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: not a pickle of plain data ({reason}); convert it to .npz") from None
+        raise InputError(f"{path}: not a pickle of plain data ({one_line(error)}); convert it to .npz") from None
 
 
 def _size(value: Any, known: dict[int, int]) -> int:

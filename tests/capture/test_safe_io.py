@@ -5,6 +5,7 @@ import resource
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -134,3 +135,9 @@ def test_a_machine_without_room_for_open_files_is_not_bad_input(read: Callable[[
             read(image)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_an_image_that_fails_without_a_message_is_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Image, "open", mock.Mock(side_effect=ValueError))
+    with pytest.raises(InputError, match=r"not a readable image \(ValueError\)"):
+        read_image(tmp_path / "000000.png")
