@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from prefect import flow
 
 from flows.preparation import Prepared, ingest_part, prepare_training
@@ -18,6 +17,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings, title_of
 from hnerf.errors import InputError, NotApplicableError, one_line
 from hnerf.evaluation.evaluate import reason_without_surface
+from hnerf.evaluation.images import mean_of
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
 from hnerf.files import embed_images, replace_text
 from hnerf.study.degradations.catalogue import KINDS, Degradation, degrade_settings
@@ -157,9 +157,8 @@ def means_in_common(one: Figures, other: Figures) -> Figures:
     counts."""
     images = [score for view, score in one["images"].items() if view in other["images"]]
     surfaces = [chamfer_mm for frame, chamfer_mm in one["surfaces"].items() if frame in other["surfaces"]]
-    known = {key: [s[key] for s in images if s.get(key) is not None] for key in IMAGE_FIGURES}
-    means = {key: float(np.mean(values)) if values else None for key, values in known.items()}
-    means["chamfer_mm"] = float(np.mean(surfaces)) if surfaces else None
+    means = {key: mean_of([score.get(key) for score in images]) for key in IMAGE_FIGURES}
+    means["chamfer_mm"] = mean_of(surfaces)
     return means | {"images": len(images), "surfaces": len(surfaces)}
 
 
