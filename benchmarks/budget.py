@@ -19,7 +19,7 @@ from provenance import RESULTS, SHARED, provenance, provenance_line, store_and_c
 from flows.preparation import prepare_training
 from hnerf.config import Settings, TrainingSettings, load_settings, overridden
 from hnerf.study.benchmark.plan import ScoringSettings
-from hnerf.tables import pick
+from hnerf.tables import pick, shown
 from tasks.benchmark import score_training
 from tasks.capture import ingest
 from tasks.source import read_capture
@@ -39,15 +39,15 @@ PARTS = {
     "steps": ("steps",),
     "steps on novel frames": ("novel_pose_steps",),
 }
-COLUMNS = {
-    "training_s": ("training, s", "{:.0f}"),
-    "model_mib": ("model, MiB", "{:.1f}"),
-    "peak_memory_gib": ("memory, GiB", "{:.1f}"),
-    "frame_256_s": ("256 px frame, s", "{:.2f}"),
-    "novel_view_psnr": ("PSNR", "{:.2f}"),
-    "novel_pose_psnr": ("animated", "{:.2f}"),
-    "tracked_psnr": ("tracked", "{:.2f}"),
-    "chamfer_l2_e3": ("Chamfer", "{:.3f}"),
+COLUMNS = {  # by name in the results: place among the scores, title and format
+    "training_s": ("training.seconds", "training, s", "{:.0f}"),
+    "model_mib": ("training.model_mib", "model, MiB", "{:.1f}"),
+    "peak_memory_gib": ("training.peak_memory_gib", "memory, GiB", "{:.1f}"),
+    "frame_256_s": ("frame_seconds.256", "256 px frame, s", "{:.2f}"),
+    "novel_view_psnr": ("novel_view.psnr", "PSNR", "{:.2f}"),
+    "novel_pose_psnr": ("novel_pose.psnr", "animated", "{:.2f}"),
+    "tracked_psnr": ("novel_pose_tracked.psnr", "tracked", "{:.2f}"),
+    "chamfer_l2_e3": ("novel_view.geometry.chamfer_l2_e3", "Chamfer", "{:.3f}"),
 }
 SCORING = ScoringSettings(images=8, meshes=1, snapshot_images=1, snapshot_meshes=0, frame_sizes_px=(256,))
 
@@ -74,7 +74,8 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
         if training != decided:  # a capture may have no nodes
             variants[name] = train_and_score(folder, store, settings.model_copy(update={"training": training}))[1]
     reasons = variants[DECIDED].pop("decisions")
-    return {"decisions": reasons, "variants": {name: figures(found) for name, found in variants.items()}}
+    figures = {name: {key: pick(f, place) for key, (place, *_) in COLUMNS.items()} for name, f in variants.items()}
+    return {"decisions": reasons, "variants": figures}
 
 
 def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[TrainingSettings, dict[str, Any]]:
@@ -102,22 +103,6 @@ def scaled(training: TrainingSettings, keys: tuple[str, ...], factor: float) -> 
     return overridden(training, changes)
 
 
-def figures(found: dict[str, Any]) -> dict[str, Any]:
-    """Return the scores of a variant that are shown in the table."""
-    report, view, pose = found["training"], found["novel_view"], found["novel_pose"]
-    geometry = view["geometry"] or {}
-    return {
-        "training_s": report["seconds"],
-        "model_mib": report["model_mib"],
-        "peak_memory_gib": report["peak_memory_gib"],
-        "frame_256_s": found["frame_seconds"]["256"],
-        "novel_view_psnr": view["psnr"],
-        "novel_pose_psnr": pose["psnr"],
-        "tracked_psnr": found["novel_pose_tracked"]["psnr"],
-        "chamfer_l2_e3": geometry.get("chamfer_l2_e3"),
-    }
-
-
 def as_markdown(captures: dict[str, Any]) -> str:
     """Format a section for each capture: automatic settings with reasons, then a table of the variants."""
     lines = ["# Settings chosen from the scene"]
@@ -125,14 +110,14 @@ def as_markdown(captures: dict[str, Any]) -> str:
         decisions = [[key, f"{d['value']}", d["reason"]] for key, d in found["decisions"].items()]
         lines += ["", f"## {name}", "", provenance_line(found)]
         lines += ["", *table([["setting", "value", "reason"], *decisions]), ""]
-        titles = ["", *(title for title, _ in COLUMNS.values())]
+        titles = ["", *(title for _, title, _ in COLUMNS.values())]
         lines += table([titles, *([title, *cells(row)] for title, row in found["variants"].items())])
     return "\n".join([*lines, ""])
 
 
 def cells(row: dict[str, Any]) -> list[str]:
     """Format a variant's scores as table cells."""
-    return ["-" if row.get(key) is None else form.format(row[key]) for key, (_, form) in COLUMNS.items()]
+    return [shown(row.get(key), form) for key, (*_, form) in COLUMNS.items()]
 
 
 if __name__ == "__main__":
