@@ -105,7 +105,8 @@ def _open_stream(path: Path) -> cv2.VideoCapture:
     if not path.is_file():
         raise InputError(f"{path}: video missing; every calibrated camera needs one")
     check_tables(path)
-    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    # FFmpeg takes what precedes a colon in a relative path for a protocol.
+    stream = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
     if not stream.isOpened():
         raise InputError(f"{path}: not a readable video; export it again as H.264")
     return stream

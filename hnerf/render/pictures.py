@@ -75,7 +75,8 @@ def write_video(
     height_px, width_px = read(files[0]).shape[:2]
     fps = max(fps, MIN_FPS)  # two frames may be an hour apart; below about 0.001, no file would be written
     fps = round(fps, max(0, int(math.log10(65535 / fps))))  # MPEG-4's clock has at most 65535 ticks a second
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
+    # FFmpeg takes what precedes a colon in a relative path for a protocol.
+    writer = cv2.VideoWriter(str(path.absolute()), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
     for file, times in zip(files, lasts, strict=True):
         picture = cv2.cvtColor(read(file), cv2.COLOR_RGB2BGR)
         for _ in range(times):

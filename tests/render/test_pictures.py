@@ -124,6 +124,15 @@ def test_every_kind_of_image_is_also_written_as_a_video(tmp_path: Path) -> None:
             assert picture.rgb[0, 0].max() < 16  # background
 
 
+def test_a_video_in_a_folder_with_a_colon_is_no_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "take:1"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "000000.png"), np.zeros((16, 16, 3), np.uint8))
+    monkeypatch.chdir(tmp_path)
+    write_video(Path("take:1"), 5.0, [1], Path("take:1") / "colour.mp4")
+    assert next(Video.open(Path("take:1") / "colour.mp4").read([0])).rgb.shape == (16, 16, 3)
+
+
 @pytest.mark.parametrize("fps", [200 / 3, 29.97, 1000 / 3, 30 / 36_000])
 def test_a_video_has_the_frame_rate_as_exactly_as_the_format_allows(fps: float, tmp_path: Path) -> None:
     (tmp_path / "colour").mkdir()

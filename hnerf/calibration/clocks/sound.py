@@ -59,7 +59,7 @@ def read_sound(path: Path) -> np.ndarray | None:
     program = shutil.which("ffmpeg")
     if program is None or not path.is_file():
         return None
-    command = [program, "-v", "error", "-nostdin", "-i", str(path), "-vn", "-ac", "1", "-ar", str(RATE_HZ),
+    command = [program, "-v", "error", "-nostdin", "-i", str(path.absolute()), "-vn", "-ac", "1", "-ar", str(RATE_HZ),
                "-t", str(MAX_SECONDS), "-f", "s16le", "-"]  # fmt: skip
     done = subprocess.run(command, capture_output=True, check=False)
     return np.frombuffer(done.stdout, "<i2").astype(np.float32) if done.returncode == 0 and done.stdout else None
