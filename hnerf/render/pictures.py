@@ -4,6 +4,7 @@ image."""
 import math
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from hnerf.avatar.surface import normals_and_distances, posed_surface
 from hnerf.body.observations import MAX_GAP
 from hnerf.capture.capture import read_rgb, write_image
 from hnerf.capture.footage import MIN_FPS, Video
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
 
@@ -82,7 +84,9 @@ def write_video(
         for _ in range(times):
             writer.write(picture)
     writer.release()
-    count = len(Video.open(path).frames)
+    count = 0
+    with suppress(InputError):  # a file that was cut short by a full disk
+        count = len(Video.open(path).frames)
     if count != sum(lasts):
         raise OSError(f"{path}: {count} of {sum(lasts)} frames were written")
 

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import cv2
@@ -181,6 +182,15 @@ def test_only_the_requested_kinds_are_written(tmp_path: Path) -> None:
 def test_a_video_that_lost_frames_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((16, 16, 3), np.uint8))
+    whole = Video.open
     monkeypatch.setattr(pictures.Video, "open", lambda path: Video(path, (0, 1), 5.0))
     with pytest.raises(OSError, match="2 of 3 frames"):
+        write_video(tmp_path, 5.0, [1, 1, 1], tmp_path / "colour.mp4")
+
+    def cut_short(path: Path) -> Video:
+        os.truncate(path, path.stat().st_size // 2)
+        return whole(path)
+
+    monkeypatch.setattr(pictures.Video, "open", cut_short)
+    with pytest.raises(OSError, match="0 of 3 frames"):
         write_video(tmp_path, 5.0, [1, 1, 1], tmp_path / "colour.mp4")
