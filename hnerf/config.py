@@ -313,9 +313,9 @@ class LimitSettings(Section):
     """Limits: how long a stage may make no progress before it is ended, and how much memory a recording's files may
     need while they are read. No result depends on them."""
 
-    stage_s: float = Field(default=1800.0, gt=0)  # a stage may make no progress for this long, plus
-    image_s: float = Field(default=5.0, ge=0)  # this for each image: frames times cameras
-    reader_gib: float = Field(default=8.0, ge=1)  # of memory for the process that reads a recording's files
+    stage_s: float = Field(default=1800.0, gt=0, le=1e8)  # a stage may make no progress for this long, plus
+    image_s: float = Field(default=5.0, ge=0, le=1e4)  # this for each image: frames times cameras
+    reader_gib: float = Field(default=8.0, ge=1, le=1e6)  # of memory for the process that reads a recording's files
 
 
 class Settings(Section):
