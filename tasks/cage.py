@@ -141,7 +141,8 @@ def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object
     if isinstance(error, InputError):
         return {"error": "InputError", "arguments": [str(error)]}
     if isinstance(error, OSError):
-        name = None if error.filename is None else str(error.filename)
+        named = error.filename2 or error.filename  # of a copy, the file that is written
+        name = None if named is None else str(named)
         return {"error": "OSError", "arguments": [number, error.strerror or str(error), name]}
     return {"error": "other", "arguments": [traceback.format_exc()]}
 

@@ -100,7 +100,7 @@ def refuses(folder: Path) -> None:
 
 
 def finds_no_space(folder: Path) -> None:
-    raise OSError(28, "No space left on device", "/out")
+    raise OSError(28, "No space left on device", "/in", None, "/out")
 
 
 def is_wrong(folder: Path) -> None:
