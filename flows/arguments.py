@@ -1,6 +1,7 @@
 """Types of command-line arguments."""
 
 import argparse
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -9,9 +10,13 @@ MAX_COUNT = 999_999  # image names have six digits
 
 
 def path(text: str) -> Path:
-    """Return a path. An empty one, as from a variable that is not set, would be the current folder."""
+    """Return a path. An empty one, as from a variable that is not set, would be the current folder. One that is not
+    UTF-8 crashes libraries."""
     if not text:
         raise argparse.ArgumentTypeError("is empty; give a path")
+    whole = os.path.abspath(text)
+    if (shown := os.fsencode(whole).decode(errors="replace")) != whole:
+        raise argparse.ArgumentTypeError(f"{shown} is not UTF-8; rename it")
     return Path(text)
 
 

@@ -168,7 +168,7 @@ def _parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
 
     store, preset = (argparse.ArgumentParser(add_help=False) for _ in range(2))
-    store.add_argument("--store", type=path, default=Path("store"), help="folder of results (default: store)")
+    store.add_argument("--store", type=path, default="store", help="folder of results (default: store)")
     capture = argparse.ArgumentParser(add_help=False, parents=[store])
     capture.add_argument("capture", type=path, help="capture folder, or one video")
     preset.add_argument("--preset", default="fast", help="preset of configs/, or a YAML file (default: fast)")
@@ -254,7 +254,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 
 
 def _add_out(command: argparse.ArgumentParser, default: str) -> None:
-    command.add_argument("--out", type=path, default=Path(default), help=f"new folder to write (default: {default})")
+    command.add_argument("--out", type=path, default=default, help=f"new folder to write (default: {default})")
 
 
 def _add_study(command: argparse.ArgumentParser, default: str, folder: str) -> None:

@@ -146,7 +146,7 @@ def add_store_commands(store: argparse.ArgumentParser) -> None:
     added["export"].add_argument("--out", type=path, help="new file to write (default: NAME.tar)")
     added["import"].add_argument("archive", type=path, help="archive of `hnerf store export`")
     for parser in added.values():
-        parser.add_argument("--store", type=path, default=Path("store"), help="folder of results (default: store)")
+        parser.add_argument("--store", type=path, default="store", help="folder of results (default: store)")
 
 
 def duration_s(text: str) -> float:

@@ -141,6 +141,21 @@ def test_an_empty_path_is_not_taken_for_the_current_folder(capsys: pytest.Captur
     assert main(["run", ""]) == 2
 
 
+def test_a_path_that_is_not_utf8_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """OpenCV, which gets no name for it, would write to address 0."""
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    with pytest.raises(SystemExit, match="2"):
+        main(["synth", str(folder / "ada")])
+    assert capsys.readouterr().err.endswith("caf\ufffd/ada is not UTF-8; rename it\n")
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit, match="2"):
+        main(["store", "list"])
+    assert "caf\ufffd/store is not UTF-8; rename it" in capsys.readouterr().err
+
+
 def test_commands_that_read_a_recording_accept_its_memory_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
