@@ -9,7 +9,7 @@ import numpy as np
 from scipy.fft import irfft, rfft
 from scipy.signal import resample
 
-from hnerf.capture.safe_io import path_in_capture
+from hnerf.capture.safe_io import check_camera_name, file_named
 from hnerf.errors import InputError
 
 RATE_HZ = 16_000  # to which sound is resampled: it travels 2 cm per sample
@@ -53,7 +53,7 @@ def read_sound(path: Path) -> np.ndarray | None:
     """Return the sound (n,) at RATE_HZ of a video, from the .wav of the same name next to it, else, if the program
     ffmpeg is installed, from the video itself; None if there is none. Raises InputError on a .wav that cannot be read,
     or is a link."""
-    beside = path_in_capture(path.parent, path.with_suffix(".wav").name)
+    beside = file_named(path.parent, check_camera_name(path.stem, path), suffixes=(".wav",))
     if beside.is_file():
         return _read_wave(beside)
     program = shutil.which("ffmpeg")

@@ -250,7 +250,9 @@ def test_a_wave_file_next_to_a_video_is_read_at_any_sample_rate(tmp_path: Path) 
     with wave.open(str(tmp_path / "a.wav"), "wb") as file:
         file.setnchannels(2), file.setsampwidth(2), file.setframerate(48_000)
         file.writeframes(np.repeat(tone, 2).tobytes())
+    (tmp_path / "a.wav").rename(tmp_path / "a.WAV")  # as recorders name it
     sound = read_sound(tmp_path / "a.mp4")
+    (tmp_path / "a.WAV").rename(tmp_path / "a.wav")
     assert sound is not None and len(sound) == 16_000
     assert np.allclose(sound, 1000 * np.sin(2 * np.pi * 440 * np.arange(16_000) / 16_000), atol=2)
     with wave.open(str(tmp_path / "a.wav"), "wb") as file:
