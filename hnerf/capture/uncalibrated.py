@@ -38,7 +38,8 @@ def cameras_without_calibration(folder: Path) -> list[str]:
     """Return the cameras of a folder without camera poses: one for each folder in images/, else for each video in
     videos/, else for each video in the folder itself; possibly none."""
     images = path_in_capture(folder, "images")
-    folders = [path for path in sorted(images.iterdir()) if path.is_dir()] if images.is_dir() else []
+    inside = sorted(images.iterdir()) if images.is_dir() else []
+    folders = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
     if folders:
         return [check_camera_name(path.name, path) for path in folders]
     return list(by_camera(videos_in(folder)))

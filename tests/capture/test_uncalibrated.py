@@ -128,10 +128,10 @@ def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> No
     assert capture.cameras["left"].K[0, 0] == pytest.approx(0.85 * 96)
 
 
-def test_photos_next_to_videos_do_not_hide_them(tmp_path: Path) -> None:
+def test_photos_and_hidden_folders_next_to_videos_do_not_hide_them(tmp_path: Path) -> None:
     for name in ("left", "right"):
         write_video(tmp_path / f"{name}.mp4", 3)
-    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / ".thumbnails").mkdir(parents=True)  # of a file manager
     (tmp_path / "images" / "poster.jpg").touch()
     assert cameras_without_calibration(tmp_path) == ["left", "right"]
 
