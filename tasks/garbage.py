@@ -48,7 +48,7 @@ def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbag
         if name not in needed
     ]
     found += _left_behind(inventory)
-    old = [one for one in found if one.used_s <= time.time() - older_s]
+    old = [one for one in found if not older_s or one.used_s <= time.time() - older_s]  # clocks may have been ahead
     return [one for one in old if not _is_locked(inventory.store.path(one.stage, one.key, ".lock"))]
 
 

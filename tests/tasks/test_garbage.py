@@ -76,6 +76,14 @@ def test_recently_used_artifacts_stay(store: Store) -> None:
     assert garbage(store, older_s=3600) == names(before) - {before[1].name}
 
 
+def test_a_clock_that_was_ahead_keeps_nothing_of_a_removed_person(store: Store) -> None:
+    for one in run_of(store, "ada", 10):
+        os.utime(one.root.with_name(f"{one.root.name}.json"), times=(2e9 + LONG_AGO_S,) * 2)
+    shutil.rmtree(store.subject_folder("ada"))
+    everything = {f"{path.parent.name}/{path.stem}" for path in store.root.glob("*/*.json")}
+    assert len(everything) == 6 and garbage(store) == everything and garbage(store, older_s=1) == set()
+
+
 def test_an_artifact_used_between_search_and_removal_stays(store: Store) -> None:
     before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
     found = find_garbage(Inventory.of(store), 1, 0)
