@@ -147,6 +147,12 @@ class FastFieldSettings(FieldSettings):
     network_learning_rate: float = Field(default=1e-2, gt=0)  # at the start
     deformation_learning_rate: float = Field(default=1e-3, ge=0)  # in metres; 0: frames do not deform the body
 
+    @model_validator(mode="after")
+    def _half_the_samples_are_two(self) -> Self:
+        if self.samples in (1, 2):  # most steps use half of them, and opacity is between two
+            raise ValueError(f"samples is {self.samples}: set it to 3 or more, or to 0")
+        return self
+
 
 class PaperFieldSettings(FieldSettings):
     """Settings of the field `paper`, as published; distances inside it are in scene units."""

@@ -55,6 +55,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("asset: {texture_poses: 0}", "asset.texture_poses"),
         ("asset: {splats: -1}", "asset.splats"),
         ("training: {field: {kind: nerf}}", "training: nerf does not tune poses"),
+        ("training: {field: {samples: 2}}", "training.field: samples is 2"),
         ("training: {losses: {fog: 0.1}}", "training: fast does not model the background"),
     ],
 )

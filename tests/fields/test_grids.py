@@ -8,7 +8,7 @@ from hnerf.fields.grids import CanonicalField
 from tests.fields.plain_grids import everywhere
 
 SETTINGS = FastFieldSettings(
-    outer_m=0.05, geometry_cells=(1, 2), colour_cells=(1,), channels=1, width=4, pose_width=2, samples=1
+    outer_m=0.05, geometry_cells=(1, 2), colour_cells=(1,), channels=1, width=4, pose_width=2, samples=3
 )
 Y, D = torch.tensor([[0.2, 0.3, 0.4]]), torch.tensor([-0.01])
 NORMAL = torch.tensor([[1.0, 0.0, -0.5]])
