@@ -154,7 +154,7 @@ class PosedBodies:
         more, found = self._closest_on_limbs(points_m, frame, reach_m, close)
         beside_m = None if beside_m is None else beside_m[:, more]
         other = self._described(points_m[more], frame[more], found, correction, False, beside_m)
-        copies = torch.arange(len(closest.d) // len(points_m), device=more.device)
+        copies = torch.arange(1 if beside_m is None else len(beside_m), device=more.device)
         return closest.followed_by(other), (more + len(points_m) * copies[:, None]).flatten()
 
     def _closest_on_limbs(

@@ -47,6 +47,11 @@ def by_other_limbs(bodies: PosedBodies, points_m: Tensor) -> tuple[Tensor, Descr
     return more, described.pick(torch.arange(len(points_m), len(described.d)))
 
 
+def test_no_points_where_no_ray_meets_the_person() -> None:
+    more, others = by_other_limbs(swung(0.2), torch.zeros(0, 3))
+    assert len(more) == len(others.d) == 0
+
+
 def test_limbs_start_at_their_first_joints() -> None:
     limbs = limbs_rig().limbs
     assert torch.equal(limbs.vertex_limb, torch.tensor([0, 1]).repeat_interleave(4 * (LEVELS + 1)))
