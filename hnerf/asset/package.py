@@ -17,10 +17,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from zipfile import ZipFile
+from zipfile import ZipFile, is_zipfile
 
 import numpy as np
-from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
+from pxr import Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from hnerf.asset.rigs import FULL
 from hnerf.asset.splat_prim import author_splats
@@ -91,7 +91,7 @@ def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: f
         _set_units(layer, part.fps)
         layer.SetDefaultPrim(layer.OverridePrim(ROOT))
         part.author(layer)
-        layer.GetRootLayer().Save()
+        _save(layer)
     _write_interface(out / INTERFACE, parts, avatars, fps, info, CAPTURED)
     for rate in next(iter(avatars.values())).rates:
         _write_interface(out / f"avatar_{rate}.usda", parts, avatars, rate, info, f"{CAPTURED}_{rate}")
@@ -129,7 +129,7 @@ def write_splats(path: Path, avatar: StagedAvatar, splats: Splats, fps: float, i
     """Write `avatar_splats.usdc`: Gaussian splats on the surface at every frame."""
     stage = _new_stage(path, path.name, {"": avatar}, avatar.frames, fps, info)
     author_splats(stage, avatar, splats)
-    stage.GetRootLayer().Save()
+    _save(stage)
 
 
 def _prefix(topology: str) -> str:
@@ -212,7 +212,7 @@ def _write_interface(file: Path, parts: list[Part], avatars: Avatars, fps: float
         with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
             stage.GetDefaultPrim().GetPayloads().AddPayload(path)
     _select(stage, avatars, motion)
-    stage.GetRootLayer().Save()
+    _save(stage)
 
 
 def _time_range(avatars: Avatars, selected: str, fps: float) -> np.ndarray:
@@ -258,11 +258,19 @@ def _everywhere(avatar: StagedAvatar) -> np.ndarray:
     return np.concatenate([*corners, *(physique_box(avatar, name) for name in avatar.physiques_m)])
 
 
+def _save(stage: Usd.Stage) -> None:
+    """Write a stage's file. Raises OSError if USD cannot."""
+    try:
+        stage.GetRootLayer().Save()
+    except Tf.ErrorException as error:
+        raise OSError(f"{stage.GetRootLayer().realPath}: cannot be written; is the disk full?") from error
+
+
 def _package(stage: Usd.Stage, avatars: Avatars, path: Path) -> None:
     layer = Path(stage.GetRootLayer().realPath)
-    stage.GetRootLayer().Save()
+    _save(stage)
     _write_images(layer.parent, avatars)
-    if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)):
+    if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)) or not is_zipfile(path):
         raise OSError(f"{path}: USD could not write the package; is the disk full?")
     _forget_times(path)
 

@@ -1,5 +1,6 @@
 import dataclasses
 import itertools
+import resource
 import time
 from pathlib import Path
 from zipfile import ZipFile
@@ -382,3 +383,17 @@ def test_cache_holds_the_posed_points(package: Path, staged: StagedAvatar) -> No
     assert mesh.GetPointsAttr().GetTimeSamples() == list(FRAMES)
     np.testing.assert_array_equal(np.array(mesh.GetPointsAttr().Get(8)), staged.points_m[3])
     assert len(mesh.GetFaceVertexIndicesAttr().GetTimeSamples()) == 0
+
+
+@pytest.mark.parametrize("missing", [0.5, 1e-4], ids=["the layer", "the package"])
+def test_a_full_disk_is_named_as_such(missing: float, staged: StagedAvatar, tmp_path: Path) -> None:
+    """A limit on the size of files, of which the packed one is the largest, takes the place of the disk."""
+    path = tmp_path / "avatar.usdz"
+    write_usdz(path, {"": staged}, [], 10.0, INFO)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int((1 - missing) * path.stat().st_size), limits[1]))
+    try:
+        with pytest.raises(OSError, match="is the disk full"):
+            write_usdz(path, {"": staged}, [], 10.0, INFO)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
