@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import shutil
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -56,10 +57,11 @@ def _link(folder: Path, name: str) -> None:
 
 
 def _huge_png(folder: Path) -> None:
-    """Write a PNG whose header claims 60000 x 60000 pixels."""
+    """Write a PNG whose header, with its checksum, claims 7000 x 7000 pixels, which Pillow itself accepts."""
     path = folder / "images/02/000003.png"
     data = bytearray(path.read_bytes())
-    data[16:24] = (60000).to_bytes(4, "big") * 2
+    data[16:24] = (7000).to_bytes(4, "big") * 2
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
     path.write_bytes(data)
 
 
@@ -83,14 +85,14 @@ def _call_a_camera_file(folder: Path) -> None:
 
 
 EASYMOCAP = {
-    "extri missing": (lambda f: (f / "extri.yml").unlink(), "extri.yml"),
-    "intri is a pickle": (_written("intri.yml", pickle.dumps(Bomb())), "intri.yml"),
-    "intri is an ASCII pickle": (_written("intri.yml", pickle.dumps(Bomb(), 0)), "intri.yml"),
-    "intri is deeply nested": (_written("intri.yml", "%YAML:1.0\n---\na: " + "[" * 5000), "intri.yml"),
+    "extri missing": (lambda f: (f / "extri.yml").unlink(), "walker: no calibration of its cameras (extri.yml or"),
+    "intri is a pickle": (_written("intri.yml", pickle.dumps(Bomb())), "intri.yml: is not UTF-8 text"),
+    "intri is an ASCII pickle": (_written("intri.yml", pickle.dumps(Bomb(), 0)), "intri.yml: not an OpenCV YAML"),
+    "intri is deeply nested": (_written("intri.yml", "%YAML:1.0\n---\na: " + "[" * 5000), "(nested more than 32"),
     "NaN in K": (_edited("intri.yml", "20.", ".Nan"), "intri.yml: K_01"),
     "NaN in T": (_edited("extri.yml", "data: [ 0., 1., 3. ]", "data: [ .Nan, 1., 3. ]"), "extri.yml: T_01"),
     "plain nan in K": (_edited("intri.yml", "20.", "nan"), "intri.yml: camera 01: K"),
-    "zero focal length in K": (_edited("intri.yml", "20.", "0."), "intri.yml"),
+    "zero focal length in K": (_edited("intri.yml", "20.", "0."), "intri.yml: camera 01: K"),
     "aliases in intri": (
         _edited("intri.yml", "names:", f"a: &a [{'x,' * 9}]\nb: &b [{'*a,' * 9}]\nnames: [*b]\nc:"),
         "intri.yml: not an OpenCV YAML file (aliases",
@@ -110,23 +112,23 @@ EASYMOCAP = {
     "camera not in extri": (_edited("extri.yml", "T_02", "T_03"), "extri.yml: T_02"),
     "matrix of a billion rows": (_edited("intri.yml", "rows: 3", "rows: 1000000000"), "intri.yml: K_01"),
     "matrix shorter than declared": (_edited("intri.yml", "cols: 3", "cols: 5"), "intri.yml: K_01"),
-    "intri of a gigabyte": (lambda f: os.truncate(f / "intri.yml", 10**9), "intri.yml"),
-    "camera name leaves the folder": (_edited("intri.yml", '"01"', '"../01"'), "intri.yml"),
+    "intri of a gigabyte": (lambda f: os.truncate(f / "intri.yml", 10**9), "intri.yml: 1000000000 bytes are"),
+    "camera name leaves the folder": (_edited("intri.yml", '"01"', '"../01"'), "intri.yml: camera name '../01'"),
     "camera named like an argument of np.savez": (_call_a_camera_file, "intri.yml: a camera cannot be"),
-    "camera without a folder": (lambda f: (f / "images/02").rename(f / "images/03"), "images/02"),
+    "camera without a folder": (lambda f: (f / "images/02").rename(f / "images/03"), "images/02: no JPEG or PNG"),
     "camera without images": (
         lambda f: [p.unlink() for p in (f / "images/02").iterdir()],
         "add them, or leave the camera out of [cameras] in capture.toml",
     ),
     "unequal frame counts": (lambda f: (f / "images/02/000002.png").unlink(), "02: 4 frames, but camera 01 has 5"),
-    "frame without a number": (lambda f: (f / "images/01/000001.png").rename(f / "images/01/a.png"), "images/01/a.png"),
-    "unreadable image": (_written("images/01/000001.png", b"nothing"), "images/01/000001.png"),
-    "image cut short": (lambda f: os.truncate(f / "images/01/000001.png", 700), "images/01/000001.png"),
+    "frame without a number": (lambda f: (f / "images/01/000001.png").rename(f / "images/01/a.png"), "a.png: images"),
+    "unreadable image": (_written("images/01/000001.png", b"nothing"), "images/01/000001.png: not a readable image"),
+    "image cut short": (lambda f: os.truncate(f / "images/01/000001.png", 700), "image file is truncated"),
     "all images are black": (
         lambda f: [write_image(p, np.full((16, 24, 3), 5, np.uint8)) for p in (f / "images/02").iterdir()],
         "images/02: all pictures are black",
     ),
-    "image of enormous size": (_huge_png, "images/02/000003.png"),
+    "image of enormous size": (_huge_png, "images/02/000003.png: declares 7000 x 7000 px"),
     "image of another size": (
         lambda f: write_image(f / "images/01/000002.png", np.zeros((8, 8, 3), np.uint8)),
         "images/01/000002.png: is 8 x 8 px",
@@ -138,7 +140,7 @@ EASYMOCAP = {
     ),
     "plate of another size": (
         lambda f: write_image(f / "background/01.png", np.zeros((8, 8, 3), np.uint8)),
-        "background/01.png",
+        "background/01.png: is 8 x 8 px, but",
     ),
     "mask missing": (
         lambda f: write_image(f / "masks/01/000002.png", np.zeros((16, 24, 3), np.uint8)),
@@ -149,20 +151,20 @@ EASYMOCAP = {
         lambda f: (f / KEYPOINTS).unlink(),
         "openpose/01: 4 keypoints for 5 frames; give one for each (an empty list of people where nobody is seen)",
     ),
-    "keypoints are a pickle": (_written(KEYPOINTS, pickle.dumps(Bomb())), "000001_keypoints.json"),
+    "keypoints are a pickle": (_written(KEYPOINTS, pickle.dumps(Bomb())), "000001_keypoints.json: is not UTF-8"),
     "keypoints are an archive": (
         lambda f: np.savez(open(f / KEYPOINTS, "wb"), a=1),  # noqa: SIM115
-        "000001_keypoints.json",
+        "000001_keypoints.json: is not UTF-8",
     ),
     "keypoints of another model": (
         lambda f: rec.write_keypoints(f / KEYPOINTS, [np.zeros((18, 3))]),
-        "000001_keypoints.json",
+        "18 keypoints a person where others have 25",
     ),
     "keypoint with too many digits": (
         _edited(KEYPOINTS, "4.0", "9" * 400),
         "000001_keypoints.json: keypoints are not triples of numbers",
     ),
-    "keypoints are deeply nested": (_written(KEYPOINTS, "[" * 100_000), "000001_keypoints.json"),
+    "keypoints are deeply nested": (_written(KEYPOINTS, "[" * 100_000), "000001_keypoints.json: is not JSON"),
     "keypoints as fractions of the image size": (
         _scale_keypoints(0.1),
         "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to",
@@ -176,7 +178,7 @@ EASYMOCAP = {
         _shoulder(1e308, 1e308, 1),
         "000001_keypoints.json: a keypoint is beyond 1e+06",
     ),
-    "NaN keypoint": (_shoulder(np.nan, 0.5, 0.5), "000001_keypoints.json"),
+    "NaN keypoint": (_shoulder(np.nan, 0.5, 0.5), "000001_keypoints.json: a keypoint is NaN"),
     "a thousand people": (_written(KEYPOINTS, json.dumps({"people": [{}] * 1000})), "1000 people"),
     "file in place of the keypoints' folder": (
         lambda f: _file_in_place_of(f / "openpose"),
@@ -201,14 +203,14 @@ EASYMOCAP = {
     "toml with an integer of 4000 digits": (_toml("fps = " + "9" * 4000), "capture.toml: fps"),
     "toml with a frame rate near zero": (_toml("fps = 1e-300"), "capture.toml: fps"),
     "toml with a unit near zero": (_toml("units = 1e-300"), "capture.toml: units"),
-    "toml is not TOML": (_toml("name = "), "capture.toml"),
+    "toml is not TOML": (_toml("name = "), "capture.toml: is not TOML"),
     "toml with an unknown key": (_toml('[cameras]\ntrain = ["01"]\nvalidation = ["02"]\n'), "cameras.validation"),
     "toml with cameras outside their table": (
         _toml('train = ["01"]\ntest = ["02"]\n'),
         "capture.toml: test is in no table; put it under [cameras]",
     ),
     "toml with frames outside their table": (_toml("novel_pose = [3]\n"), "novel_pose is in no table; put it under [f"),
-    "toml with unknown units": (_toml('units = "inch"\n'), "units"),
+    "toml with unknown units": (_toml('units = "inch"\n'), 'units: give "m", "mm"'),
     "toml with a mistyped table": (_toml('[Camera]\ntrain = ["01"]\n'), "Camera has no meaning; did you mean cameras?"),
     "toml with a mistyped key": (_toml('unit = "mm"\n'), "unit has no meaning; did you mean units?"),
     "toml in another encoding": (_written("capture.toml", b'name = "J\xfcrgen"'), "is not UTF-8"),
@@ -238,7 +240,7 @@ EASYMOCAP = {
 
 POSE2SIM = {
     "no calibration file": (lambda f: (f / TABLES).unlink(), "walker: 2 videos without calibration"),
-    "calibration is a pickle": (_written(TABLES, pickle.dumps(Bomb())), "Calib.toml"),
+    "calibration is a pickle": (_written(TABLES, pickle.dumps(Bomb())), "Calib.toml: is not UTF-8 text"),
     "NaN": (_edited(TABLES, "50.0", "nan"), "Calib.toml: camera cam01: K"),
     "key missing": (_edited(TABLES, "rotation", "rot"), "Calib.toml: camera cam01: 'rotation'"),
     "camera is not a table": (_edited(TABLES, "[cam01]", "cam03 = 1\n[cam01]"), "camera cam03"),
@@ -247,12 +249,12 @@ POSE2SIM = {
         "Calib.toml: two cameras are called cam01",
     ),
     "fisheye": (_edited(TABLES, "fisheye = false", "fisheye = true"), "fisheye"),
-    "video missing": (lambda f: (f / "videos/cam02.mp4").unlink(), "videos/cam02.mp4"),
+    "video missing": (lambda f: (f / "videos/cam02.mp4").unlink(), "images/cam02: no JPEG or PNG"),
     "two videos of one camera": (
         lambda f: shutil.copy(f / "videos/cam02.mp4", f / "videos/cam02.MOV"),
         "videos/cam02.mp4: camera cam02 is also cam02.MOV; keep one of them",
     ),
-    "video is not a video": (_written("videos/cam02.mp4", b"0" * 100), "videos/cam02.mp4"),
+    "video is not a video": (_written("videos/cam02.mp4", b"0" * 100), "videos/cam02.mp4: not a readable video"),
     "video is a playlist of other files": (
         lambda f: [
             (f / "videos/cam02.mp4").rename(f / "videos/cam02"),

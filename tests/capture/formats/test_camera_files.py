@@ -78,23 +78,23 @@ def test_a_colmap_model_is_read(binary: bool, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "at", "value"),
+    ("name", "at", "value", "message"),
     [
-        ("cameras.bin", 0, struct.pack("<Q", 1 << 60)),  # number of cameras
-        ("images.bin", 0, struct.pack("<Q", 1 << 60)),  # number of images
-        ("cameras.bin", 12, struct.pack("<i", 5)),  # OPENCV_FISHEYE
-        ("cameras.bin", 16, struct.pack("<Q", 1 << 40)),  # width
-        ("images.bin", 8 + 64 + len("01/000000.jpg") + 1, struct.pack("<Q", 1 << 60)),  # number of points
-        ("images.bin", 12, struct.pack("<d", float("nan"))),  # quaternion
-        ("images.bin", 8 + 64, b"../../etc/pwd"),  # name
+        ("cameras.bin", 0, struct.pack("<Q", 1 << 60), "not a COLMAP model"),  # number of cameras
+        ("images.bin", 0, struct.pack("<Q", 1 << 60), "not a COLMAP model"),  # number of images
+        ("cameras.bin", 12, struct.pack("<i", 5), "other cameras than SIMPLE_PINHOLE"),  # OPENCV_FISHEYE
+        ("cameras.bin", 16, struct.pack("<Q", 1 << 40), "declares 1.09951e.12 x 480 px"),  # width
+        ("images.bin", 86, struct.pack("<Q", 1 << 60), "not a COLMAP model"),  # number of points, after the name
+        ("images.bin", 12, struct.pack("<d", float("nan")), "its quaternion is not of length 1"),
+        ("images.bin", 72, b"../../etc/pwd", r"camera name '\.\.'"),
     ],
 )
-def test_hostile_colmap_models_are_refused(name: str, at: int, value: bytes, tmp_path: Path) -> None:
+def test_hostile_colmap_models_are_refused(name: str, at: int, value: bytes, message: str, tmp_path: Path) -> None:
     path = write_model(tmp_path, binary=True) / "sparse" / "0" / name
     data = bytearray(path.read_bytes())
     data[at : at + len(value)] = value
     path.write_bytes(data)
-    with pytest.raises(InputError, match=name):
+    with pytest.raises(InputError, match=f"{name}: .*{message}"):
         Colmap(tmp_path).lenses()
 
 
