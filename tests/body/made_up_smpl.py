@@ -31,14 +31,14 @@ LANDMARKS = (
 )  # fmt: skip
 
 
-def made_up_smpl(kind: str = "smpl", seed: int = 0) -> dict[str, Any]:
+def made_up_smpl(kind: str = "smpl") -> dict[str, Any]:
     """Return the arrays of a model file. Shapes 0 to 3 make everything larger, the legs longer, the arms longer and the
     hips wider; the others change limbs a little. The only pose blend shape lifts the vertices of the left forearm when
     the left elbow turns."""
     joints_m, parents = _skeleton(kind)
     count = {"smpl": 6890, "smplx": 10475}[kind]
     tube = count // len(joints_m)
-    moves = _joint_shapes(joints_m, parents, np.random.default_rng(seed))  # (J, 3, 10)
+    moves = _joint_shapes(joints_m, parents, np.random.default_rng(0))  # (J, 3, 10)
     vertices, shapes = np.zeros((count, 3)), np.zeros((count, 3, 10))
     weights, regressor = np.zeros((count, len(joints_m))), np.zeros((len(joints_m), count))
     faces = []

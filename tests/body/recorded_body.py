@@ -31,12 +31,12 @@ def silhouettes(capture: Capture, body: BodyFit) -> Masks:
     return Masks(encoded, {})
 
 
-def ring_camera(name: str, angle: float, size_px: int = 256) -> Camera:
-    """Return a camera 3 m from the z axis at a height of 1 m, looking horizontally at the axis."""
+def ring_camera(name: str, angle: float) -> Camera:
+    """Return a camera 3 m from the z axis at a height of 1 m, looking horizontally at the axis; 256 x 256 px."""
     forward = -np.array([np.cos(angle), np.sin(angle), 0])
     R = np.stack([np.cross(forward, [0, 0, 1]), [0, 0, -1], forward])
-    K = np.array([[size_px * 1.1, 0, size_px / 2], [0, size_px * 1.1, size_px / 2], [0, 0, 1]])
-    return Camera(name, K, R, -R @ np.array([*(-3 * forward[:2]), 1.0]), size_px, size_px)
+    K = np.array([[281.6, 0, 128], [0, 281.6, 128], [0, 0, 1]])
+    return Camera(name, K, R, -R @ np.array([*(-3 * forward[:2]), 1.0]), 256, 256)
 
 
 RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}

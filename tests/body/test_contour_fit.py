@@ -44,9 +44,9 @@ def ball(radius_m: float, height_m: float) -> tuple[np.ndarray, np.ndarray]:
     return points * radius_m + (0, 0, height_m), faces
 
 
-def disc(radius_px: float, size_px: int = 256) -> np.ndarray:
-    y, x = np.mgrid[:size_px, :size_px]
-    return (x - size_px / 2) ** 2 + (y - size_px / 2) ** 2 < radius_px**2
+def disc(radius_px: float) -> np.ndarray:
+    y, x = np.mgrid[:256, :256] - 128
+    return x**2 + y**2 < radius_px**2
 
 
 def matched(edge: Outline, match: Callable[..., ContourResiduals] = NAKED) -> tuple[ContourResiduals, np.ndarray]:

@@ -21,6 +21,7 @@ from hnerf.body.ground import Ground
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
+from hnerf.capture.capture import Capture
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from tests.body import recorded_body
@@ -125,10 +126,10 @@ def test_an_unlikely_stature_from_one_camera_is_warned_about(
         assert words in caplog.text and bool(words) == bool(caplog.text)
 
 
-@pytest.mark.usefixtures("few_steps")
 def test_the_stature_warning_depends_on_whether_one_was_stated(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("hnerf.body.fit.KEYPOINT_STEPS", 1)
     monkeypatch.setattr("hnerf.body.fit.MAX_STATURE_SIGMAS", 0)
     for stature_m, advice in ((None, "State their height"), (1.7, "1.70 m stated: do they stand on world height 0")):
         caplog.clear()
@@ -216,24 +217,22 @@ def test_a_frame_that_shows_too_little_starts_where_the_frame_nearest_in_time_do
     assert torch.equal(root[2], root[3]) and not torch.equal(root[1], root[3])
 
 
-def test_runs_break_at_gaps_and_between_two_splits(tmp_path: Path) -> None:
-    capture = record(tmp_path, moving_body((0, 1, 2, 5, 6)), RING, ("0",))
-    one_split = replace(capture, train_frames=capture.frames, novel_pose_frames=())
-    assert runs(one_split) == [(0, 1, 2), (5, 6)]
-    assert runs(replace(capture, train_frames=(0, 5, 6), novel_pose_frames=(1, 2))) == [(0, 1, 2), (5, 6)]
-    assert runs(replace(capture, train_frames=(0,), novel_pose_frames=(1, 2, 5, 6))) == [(0,), (1, 2), (5, 6)]
-
-
-def test_frames_with_a_stride_form_one_run(tmp_path: Path) -> None:
-    capture = record(tmp_path, moving_body((0, 3, 6, 15, 18)), RING, ("0",))
-    assert runs(capture) == [(0, 3, 6), (15, 18)]
-
-
-def test_unevenly_spaced_frames_form_runs(tmp_path: Path) -> None:
-    """The median of the gaps 2, 4, 2, 2, 5, 1 is 2. A gap of 4 is twice that and continues a run; a gap of 5 is more
-    and ends it."""
-    capture = record(tmp_path, moving_body((0, 2, 6, 8, 10, 15, 16)), RING, ("0",))
-    assert runs(replace(capture, train_frames=capture.frames)) == [(0, 2, 6, 8, 10), (15, 16)]
+@pytest.mark.parametrize(
+    ("train", "novel", "expected"),
+    [
+        ((0, 1, 2, 5, 6), (), [(0, 1, 2), (5, 6)]),
+        ((0, 5, 6), (1, 2), [(0, 1, 2), (5, 6)]),
+        ((0,), (1, 2, 5, 6), [(0,), (1, 2), (5, 6)]),
+        ((0, 3, 6, 15, 18), (), [(0, 3, 6), (15, 18)]),
+        ((0, 2, 6, 8, 10, 15, 16), (), [(0, 2, 6, 8, 10), (15, 16)]),
+    ],
+)
+def test_runs_break_at_gaps_and_between_two_splits(
+    train: tuple[int, ...], novel: tuple[int, ...], expected: list[tuple[int, ...]]
+) -> None:
+    """The last case has gaps of 2, 4, 2, 2, 5 and 1, with a median of 2. A gap of 4 is twice that and continues a run;
+    a gap of 5 is more and ends it."""
+    assert runs(Capture("ada", Path(), {}, (), (), train, novel, 25.0, "z", {}, {})) == expected
 
 
 def test_the_normal_equations_contain_the_gradient_of_the_cost(tmp_path: Path) -> None:

@@ -35,12 +35,9 @@ def cost_of(pose: Pose) -> float:
     return PRIOR.add(NormalEquations(1, ARTICULATION.unknowns, 0), pose)
 
 
-def test_the_most_likely_pose_costs_nothing() -> None:
-    assert cost_of(resting()) < 1e-12
-
-
-def test_one_standard_deviation_of_flexion_costs_one_half() -> None:
+def test_the_most_likely_pose_costs_nothing_and_one_standard_deviation_of_flexion_one_half() -> None:
     """A foot flexes about the left-right axis, perpendicular to the foot, with a standard deviation of 20 degrees."""
+    assert cost_of(resting()) < 1e-12
     assert math.isclose(cost_of(flexed("foot.L", math.radians(20))), 0.5, rel_tol=1e-9)
 
 

@@ -11,9 +11,10 @@ from tests.body.two_bone import two_bone_rig
 HALF_PI = math.pi / 2
 
 
-def bent(axis: int = 1, angle: float = HALF_PI) -> torch.Tensor:
+def bent() -> torch.Tensor:
+    """Return a quarter turn of the elbow about y."""
     theta = torch.zeros(3, 3, dtype=torch.float64)
-    theta[1, axis] = angle
+    theta[1, 1] = HALF_PI
     return theta
 
 
