@@ -173,8 +173,13 @@ def test_one_turned_camera_is_named_and_refined(tmp_path: Path) -> None:
     assert true_error_px(capture.cameras["c2"], ring(4)[2]) == pytest.approx(17.5, abs=1)
     report = check_calibration(capture, SETTINGS)
     assert [verdict.status for verdict in report.verdicts.values()] == ["ok", "ok", "refined", "ok"]
-    assert any("an outlier" in reason for reason in report.verdicts["c2"].reasons)
     assert true_error_px(report.cameras["c2"], ring(4)[2]) < 1
+    reasons_of = {name: " | ".join(verdict.reasons) for name, verdict in report.verdicts.items()}
+    for part in ("an outlier", "turned by 1.0", "pose refined: held-out frames go from"):
+        assert part in reasons_of["c2"]
+    assert all("pose kept: refining it takes held-out frames from" in reasons_of[name] for name in ("c0", "c1", "c3"))
+    assert all("offset in time" in text or "in step" in text for text in reasons_of.values())
+    assert {"as given", "pose of c0 refined", "pose of c2 refined"} <= set(report.held_out_px)
     report.save(tmp_path / "out")
     used = load_cameras(tmp_path / "out", capture).cameras
     np.testing.assert_allclose(used["c2"].R, report.cameras["c2"].R, atol=1e-12)

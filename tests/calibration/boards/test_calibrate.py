@@ -117,15 +117,6 @@ def test_offsets_are_in_frames_of_the_footage() -> None:
     assert max(figures["turned_deg"] for figures in compare_pairs(cameras, fit.cameras).values()) < 0.3
 
 
-def test_frames_across_a_gap_are_not_neighbours() -> None:
-    """The board does not move straight from one burst of images to the next; assuming so costs 2 degrees and 5 cm."""
-    cameras, frames = rig(), [first + i for first in (0, 20, 40, 60) for i in range(4)]
-    fit = solve_rig(cameras, planar_corners(corners_of(seen(cameras, {"b": LAG}, frames), frames)))
-    for figures in compare_pairs(cameras, fit.cameras).values():
-        assert figures["turned_deg"] < 1 and figures["moved_cm"] < 2
-    assert np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0]) == pytest.approx(LAG, abs=0.1)
-
-
 def test_off_plane_corners_and_images_with_few_corners_are_dropped() -> None:
     corners_px = seen(rig(), {})[:1, :2]
     corners_px[0, 0, 7] += [3.0, 0]
@@ -180,11 +171,12 @@ def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
 
 
 def test_board_evidence_allows_for_gaps_between_frames(tmp_path: Path) -> None:
-    """In bursts of images that b takes LAG later, each camera still fits its own footage."""
+    """b takes each image LAG later, in bursts. The board does not move straight from one burst to the next; assuming so
+    costs 2 degrees and 5 cm."""
     cameras, frames = rig(), tuple(first + i for first in (0, 20, 40, 60) for i in range(4))
     found = evidence(tmp_path, cameras, seen(cameras, {"b": LAG}, frames), frames)
     assert max(camera["footage_rms_px"] for camera in found["cameras"].values()) < 0.6
-    assert max(pair["turned_deg"] for pair in found["pairs"].values()) < 1
+    assert all(pair["turned_deg"] < 1 and pair["moved_cm"] < 2 for pair in found["pairs"].values())
 
 
 def test_a_visible_board_faces_the_camera_is_inside_the_image_and_found_by_another_camera() -> None:
@@ -223,6 +215,8 @@ def test_a_lens_is_reliable_only_if_the_images_determine_it() -> None:
 
 
 def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Footage that does not fix them leaves given ones, which take the size of the footage if they state none."""
+
     def footage(part: str, corners_px: np.ndarray) -> BoardFootage:
         seen_px, size_px = {"a": corners_px}, {"a": (1280, 720)}
         return BoardFootage(tmp_path / part, BOARD, tuple(range(len(corners_px))), 1, seen_px, size_px)
@@ -235,26 +229,14 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
     read["intrinsic"] = footage("intrinsic", close_up(0.7)[:9])
     with pytest.raises(InputError, match="intrinsic/a: does not fix the intrinsics"):
         calibrate_from_boards(tmp_path)
-    given = Lens("a", np.array([[901.0, 0, 640], [0, 901, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0]), np.eye(3),
-                 np.zeros(3), (1280, 720))  # fmt: skip
-    write_cameras(tmp_path, [given], "easymocap")
-    calibration = calibrate_from_boards(tmp_path)
-    assert calibration.lenses["a"].K[0, 0] == 901
-    assert calibration.intrinsics["a"].startswith("given; not verified by the footage (9 pictures")
+    K, distortion = np.array([[901.0, 0, 640], [0, 901, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0])
+    for size_px in (None, (1280, 720)):
+        write_cameras(tmp_path, [Lens("a", K, distortion, np.eye(3), np.zeros(3), size_px)], "easymocap")
+        calibration = calibrate_from_boards(tmp_path)
+        assert calibration.lenses["a"].K[0, 0] == 901 and calibration.lenses["a"].size_px == (1280, 720)
+        assert calibration.intrinsics["a"].startswith("given; not verified by the footage (9 pictures")
     read["intrinsic"] = footage("intrinsic", close_up(0.7))
     assert calibrate_from_boards(tmp_path).intrinsics["a"].startswith("from intrinsic/: 20 pictures")
-
-
-def test_given_intrinsics_without_a_size_take_the_size_of_the_footage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given = Lens("a", np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0]), np.eye(3),
-                 np.zeros(3), None)  # fmt: skip
-    write_cameras(tmp_path, [given], "easymocap")
-    footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), 1, {"a": close_up(0.7)[:9]}, {"a": (1280, 720)})
-    read = {"extrinsic": footage, "intrinsic": None}
-    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part, *__: read[part])
-    assert calibrate_from_boards(tmp_path).lenses["a"].size_px == (1280, 720)
 
 
 @pytest.mark.parametrize("kind", ["easymocap", "caliscope"])

@@ -234,29 +234,31 @@ def test_unrelated_sound_gives_no_offset() -> None:
     assert sound_offset(rng.normal(size=50_000), rng.normal(size=60_000)) is None
 
 
+def write_sound(folder: Path, samples: bytes, rate_hz: int = 16_000, channels: int = 1) -> None:
+    """Write 16-bit sound as a.wav."""
+    with wave.open(str(folder / "a.wav"), "wb") as file:
+        file.setparams((channels, 2, rate_hz, 0, "NONE", "none"))
+        file.writeframes(samples)
+
+
 def test_silence_and_a_click_give_no_offset(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).normal(size=50_000)
     assert sound_offset(noise, np.zeros(50_000)) is None and sound_offset(np.zeros(50_000), np.zeros(50_000)) is None
     assert sound_offset(noise, noise[:300]) is None and sound_offset(noise[:300], noise[:300]) is None
-    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
-        file.setparams((1, 2, 48_000, 0, "NONE", "none"))
-        file.writeframes(b"\1\0")
+    write_sound(tmp_path, b"\1\0", 48_000)
     sound = read_sound(tmp_path / "a.mp4")
     assert sound is not None and len(sound) == 1
 
 
 def test_a_wave_file_next_to_a_video_is_read_at_any_sample_rate(tmp_path: Path) -> None:
     tone = (1000 * np.sin(2 * np.pi * 440 * np.arange(48_000) / 48_000)).astype("<i2")
-    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
-        file.setnchannels(2), file.setsampwidth(2), file.setframerate(48_000)
-        file.writeframes(np.repeat(tone, 2).tobytes())
+    write_sound(tmp_path, np.repeat(tone, 2).tobytes(), 48_000, channels=2)
     (tmp_path / "a.wav").rename(tmp_path / "a.WAV")  # as recorders name it
     sound = read_sound(tmp_path / "a.mp4")
     (tmp_path / "a.WAV").rename(tmp_path / "a.wav")
     assert sound is not None and len(sound) == 16_000
     assert np.allclose(sound, 1000 * np.sin(2 * np.pi * 440 * np.arange(16_000) / 16_000), atol=2)
-    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
-        file.setparams((1, 2, 16_000, 0, "NONE", ""))
+    write_sound(tmp_path, b"")
     with pytest.raises(InputError, match=r"a\.wav: holds no sound"):
         read_sound(tmp_path / "a.mp4")
     (tmp_path / "a.wav").write_bytes(b"RIFF")
@@ -266,9 +268,7 @@ def test_a_wave_file_next_to_a_video_is_read_at_any_sample_rate(tmp_path: Path) 
 
 def test_a_malformed_or_linked_wave_file_is_refused(tmp_path: Path) -> None:
     """Bytes 16 to 19 are the size of the format chunk."""
-    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
-        file.setparams((1, 2, 16_000, 0, "NONE", "none"))
-        file.writeframes(bytes(20))
+    write_sound(tmp_path, bytes(20))
     with (tmp_path / "a.wav").open("r+b") as raw:
         raw.seek(16)
         raw.write((500).to_bytes(4, "little"))
