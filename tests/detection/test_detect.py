@@ -22,6 +22,7 @@ from hnerf.detection.landmarks import Person
 from hnerf.detection.region import Region
 from hnerf.errors import InputError
 from hnerf.models import SHA256, has_model
+from tests.calibration.synthetic import edited_keypoints
 from tests.capture.recordings import write_easymocap
 from tests.shared_data import shared_capture
 
@@ -75,10 +76,17 @@ def test_keypoints_come_from_the_network_and_the_rest_from_the_recording(recordi
     assert mask.shape == (16, 24) and mask[4, 5] == 255 and mask[15, 23] == 0
 
 
-def test_with_source_both_the_recordings_own_keypoints_are_kept(recording: Capture, tmp_path: Path) -> None:
+def test_with_source_both_the_recordings_own_keypoints_are_kept_and_completed(
+    recording: Capture, tmp_path: Path
+) -> None:
+    """Its person is where the network sees one, surer of all points but the right ankle, which it lacks."""
+    with edited_keypoints(recording.root) as own:
+        own["01"][:] = 5, 4, 0.9
+        own["01"][:, :, 11] = 0
     detect(recording, BOTH, tmp_path / "out")
-    kept, own = Capture.load(tmp_path / "out").keypoints("01"), recording.keypoints("01")
-    assert kept is not None and own is not None and np.array_equal(kept, own)
+    kept = Capture.load(tmp_path / "out").keypoints("01")
+    assert kept is not None and kept.shape == (5, 1, 25, 3)
+    assert kept[:, 0, 11].tolist() == [[5, 4, 0.5]] * 5 and (np.delete(kept, 11, 2) == [5, 4, 0.9]).all()
 
 
 def test_cameras_that_are_done_are_not_processed_again(recording: Capture, tmp_path: Path) -> None:

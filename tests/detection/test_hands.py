@@ -19,9 +19,9 @@ from tests.capture.recordings import write_easymocap
 IMAGE = np.zeros((400, 400, 3), np.uint8)
 
 
-def flat_hand(wrist: tuple[float, float], confidence: float = 0.9) -> np.ndarray:
+def flat_hand(wrist: tuple[float, float]) -> np.ndarray:
     """Return a hand with fingers up: 40 px from wrist to knuckles, which span 30 px. Palm points reach 50 px high."""
-    points = np.tile([*wrist, confidence], (21, 1))
+    points = np.tile([*wrist, 0.9], (21, 1))
     for finger, x in zip((1, 5, 9, 13, 17), (-15, -15, 0, 15, 15), strict=True):
         for segment in range(4):
             points[finger + segment, :2] += x, -40 - 10 * segment

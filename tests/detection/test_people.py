@@ -16,9 +16,9 @@ from tests.calibration.synthetic import ring, write_capture
 SIZE_PX = 100
 
 
-def standing(x: float, height_px: float = 90.0, top: float = 5.0) -> np.ndarray:
-    """Return keypoints (25, 3) on a line from (x, top) downwards."""
-    return np.column_stack([np.full(25, x), np.linspace(top, top + height_px, 25), np.full(25, 0.9)])
+def standing(x: float, height_px: float = 90.0) -> np.ndarray:
+    """Return keypoints (25, 3) on a line from (x, 5) downwards."""
+    return np.column_stack([np.full(25, x), np.linspace(5, 5 + height_px, 25), np.full(25, 0.9)])
 
 
 def track(*images: np.ndarray, moves: bool = True) -> PersonTrack:
