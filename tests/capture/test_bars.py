@@ -20,9 +20,9 @@ LENS = Lens(
 )
 
 
-def frames(height: int = 300, width: int = 200) -> list[np.ndarray]:
-    """Return three frames of noise around grey 120."""
-    return [np.random.default_rng(seed).integers(60, 180, (height, width, 3), np.uint8) for seed in range(3)]
+def frames() -> list[np.ndarray]:
+    """Return three frames of noise around grey 120, 200 x 300 px."""
+    return [np.random.default_rng(seed).integers(60, 180, (300, 200, 3), np.uint8) for seed in range(3)]
 
 
 def test_edges_are_found_to_a_fraction_of_a_pixel() -> None:

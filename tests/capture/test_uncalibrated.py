@@ -118,35 +118,21 @@ def test_a_lens_file_without_intrinsics_is_refused(tmp_path: Path) -> None:
         Uncalibrated(tmp_path, tmp_path / "extri.yml").lenses()
 
 
-def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> None:
-    folder = tmp_path / "film"
-    write_video(folder / "videos" / "left.mp4", 3, (64, 96))
-    write_video(folder / "videos" / "right.mp4", 3, (64, 96))
+@pytest.mark.parametrize("place", ["", "videos"])
+def test_videos_are_cameras_and_are_ingested_without_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    """Photos and hidden folders do not hide them. Each is decoded once to count its frames."""
+    folder, opened, opening = tmp_path / "film", list[str](), Video.open
+    for name in ("left", "right"):
+        write_video(folder / place / f"{name}.mp4", 3, (64, 96))
+    (folder / "images" / ".thumbnails").mkdir(parents=True)  # of a file manager
+    (folder / "images" / "poster.jpg").touch()
     assert cameras_without_calibration(folder) == ["left", "right"]
+    monkeypatch.setattr(Video, "open", lambda path: opened.append(path.name) or opening(path))
     capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder))
     assert capture.train_cameras == ("left", "right") and len(capture.frames) == 3
     assert capture.cameras["left"].K[0, 0] == pytest.approx(0.85 * 96)
-
-
-def test_photos_and_hidden_folders_next_to_videos_do_not_hide_them(tmp_path: Path) -> None:
-    for name in ("left", "right"):
-        write_video(tmp_path / f"{name}.mp4", 3)
-    (tmp_path / "images" / ".thumbnails").mkdir(parents=True)  # of a file manager
-    (tmp_path / "images" / "poster.jpg").touch()
-    assert cameras_without_calibration(tmp_path) == ["left", "right"]
-
-
-def test_each_video_is_decoded_once_to_count_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, opened, opening = tmp_path / "film", list[str](), Video.open
-    for name in ("left", "right"):
-        write_video(folder / f"{name}.mp4", 3)
-
-    def open_counted(path: Path) -> Video:
-        opened.append(path.name)
-        return opening(path)
-
-    monkeypatch.setattr(Video, "open", open_counted)
-    ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder))
     assert sorted(opened) == ["left.mp4", "right.mp4"]
 
 
