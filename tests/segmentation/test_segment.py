@@ -237,7 +237,7 @@ def test_a_missing_given_mask_names_the_file(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path)
     del truth["c0", 2]
     write_masks(capture, truth)
-    with pytest.raises(InputError, match=r"masks/c0/000002\.png"):
+    with pytest.raises(InputError, match=r"masks/c0/000002\.png: mask missing"):
         segment(capture, None, SETTINGS)
 
 

@@ -10,7 +10,12 @@ import pytest
 
 from hnerf.calibration.bundle import align, undistort
 from hnerf.calibration.person import calibrate, rig
-from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
+from hnerf.calibration.person.calibrate import (
+    PersonCalibration,
+    Uncertainty,
+    _check_uncertainty,
+    calibrate_from_person,
+)
 from hnerf.calibration.person.lens import fit_lenses
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import scale_to, stand_on_ground
@@ -260,7 +265,24 @@ def test_too_few_shared_keypoints_are_refused(tmp_path: Path) -> None:
 def test_recordings_of_different_times_are_refused(tmp_path: Path) -> None:
     seen = detections(ring(4), 1.0)
     seen[1] = seen[1, [5, 2, 9, 0, 11, 7, 1, 10, 4, 8, 3, 6]]
-    assert "camera c1" in refusal(tmp_path, ring(4), seen, [])
+    message = refusal(tmp_path, ring(4), seen, [])
+    assert message.startswith("ring: camera c1 does not see the same person at the same time as the others")
+
+
+def test_a_camera_that_the_keypoints_do_not_determine_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The limits are 5 degrees and a tenth of the distance from the origin, which is less than 4 m."""
+    sure = dict.fromkeys(("c0", "c1", "c2"), Uncertainty(4.9, 0.3, 0.0))
+    _check_uncertainty(ring(3), sure)
+    for unsure, words in (
+        (Uncertainty(5.1, 0.3, 0.0), "5.1 degrees, 30"),
+        (Uncertainty(4.9, 0.4, 0.0), "4.9 degrees, 40"),
+    ):
+        with pytest.raises(InputError, match=rf"camera c1 is not determined \(\+- {words} cm\)"):
+            _check_uncertainty(ring(3), sure | {"c1": unsure})
+    monkeypatch.setattr(calibrate, "MAX_TURN_SD_DEG", 0.0)
+    assert "is not determined" in refusal(tmp_path, ring(3), detections(ring(3), 1.0), [])
 
 
 def test_each_camera_takes_the_named_person_or_the_best_candidate(tmp_path: Path) -> None:
