@@ -60,11 +60,13 @@ def test_each_capture_is_started_once(watched: Path, runs: list[dict[str, Any]])
     assert [Path(run["capture"]).name for run in runs] == ["ada", "bob"]
 
 
-def test_a_copy_or_a_new_name_is_the_same_capture(watched: Path) -> None:
+def test_a_copy_or_a_new_name_is_the_same_capture_and_changed_content_a_new_one(watched: Path) -> None:
     look(watched)
     shutil.copytree(watched / "ada", watched / "copy of ada")
     (watched / "bob").rename(watched / "robert")
     assert look(watched) == []
+    (watched / "ada" / "images" / "0.jpg").write_text("other pixels")
+    assert look(watched) == ["ada"]
 
 
 def test_captures_are_trained_again_after_the_store_was_deleted(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,12 +88,6 @@ def test_captures_are_trained_again_after_the_store_was_deleted(watched: Path, m
     shutil.rmtree(watched.parent / "store")
     look(watched)
     assert len(set(keys)) == 4
-
-
-def test_changed_content_is_a_new_capture(watched: Path) -> None:
-    look(watched)
-    (watched / "ada" / "images" / "0.jpg").write_text("other pixels")
-    assert look(watched) == ["ada"]
 
 
 def test_folders_being_written_and_hidden_or_empty_folders_are_not_started(watched: Path) -> None:

@@ -320,14 +320,12 @@ def test_an_error_of_a_chart_does_not_hide_the_error_of_a_run(tmp_path: Path, mo
         study(tmp_path, only=["pose_noise"])
 
 
-@pytest.mark.parametrize("part", [{"only": ["pose_noise"]}, {"methods": ["demo"]}], ids=str)
-def test_running_a_part_leaves_the_files_of_the_whole_study_unchanged(
-    tmp_path: Path, part: dict[str, list[str]]
-) -> None:
+def test_running_a_part_leaves_the_files_of_the_whole_study_unchanged(tmp_path: Path) -> None:
     study(tmp_path)
     files = {path: path.read_bytes() for path in (tmp_path / "store" / "stability").iterdir()}
-    study(tmp_path, **part)
-    assert {path: path.read_bytes() for path in files} == files
+    for part in ({"only": ["pose_noise"]}, {"methods": ["demo"]}):
+        study(tmp_path, **part)
+        assert {path: path.read_bytes() for path in files} == files
 
 
 def test_outdated_charts_of_an_earlier_call_are_removed(tmp_path: Path) -> None:
