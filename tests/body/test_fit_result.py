@@ -7,6 +7,7 @@ import torch
 from hnerf.body import fit_result
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
+from tests.body.boxes import box_rig
 from tests.body.two_bone import two_bone_rig
 
 
@@ -28,6 +29,9 @@ def test_a_saved_fit_is_loaded_and_its_file_has_the_documented_arrays(tmp_path: 
         np.testing.assert_allclose(stored["vertices"][1, 3], [6.5, 0, 1], atol=1e-6)
         assert stored["joint_names"].tolist() == ["root", "elbow", "tip"]
         np.testing.assert_allclose(stored["beta"], [0.3])
+    box_rig().save(tmp_path / "rig.npz")
+    with pytest.raises(ValueError, match="are not 2 poses of its rig"):
+        BodyFit.load(tmp_path)
 
 
 def test_all_tensors_of_a_fit_move_to_a_device() -> None:

@@ -241,6 +241,7 @@ EASYMOCAP = {
 POSE2SIM = {
     "no calibration file": (lambda f: (f / TABLES).unlink(), "walker: 2 videos without calibration"),
     "calibration is a pickle": (_written(TABLES, pickle.dumps(Bomb())), "Calib.toml: is not UTF-8 text"),
+    "no camera": (_written(TABLES, "[metadata]\nerror = 0.0\n"), "Calib.toml: calibrates no camera"),
     "NaN": (_edited(TABLES, "50.0", "nan"), "Calib.toml: camera cam01: K"),
     "key missing": (_edited(TABLES, "rotation", "rot"), "Calib.toml: camera cam01: 'rotation'"),
     "camera is not a table": (_edited(TABLES, "[cam01]", "cam03 = 1\n[cam01]"), "camera cam03"),

@@ -197,6 +197,13 @@ def test_footage_of_different_lengths_is_refused(extrinsic: Path, tmp_path: Path
     assert read_board_footage(tmp_path, "intrinsic") is None
 
 
+def test_images_of_different_sizes_are_refused(extrinsic: Path, tmp_path: Path) -> None:
+    for number, side_px in enumerate((8, 16)):
+        write_image(extrinsic / "cam_0" / f"{number}.png", np.zeros((side_px, side_px, 3), np.uint8))
+    with pytest.raises(InputError, match=r"1\.png: is 16 x 16 px, unlike the pictures before"):
+        read_board_footage(tmp_path, "extrinsic")
+
+
 def test_links_in_the_footage_are_refused(extrinsic: Path, tmp_path: Path) -> None:
     (tmp_path / "secret").mkdir()
     extrinsic.mkdir(parents=True)

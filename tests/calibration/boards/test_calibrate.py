@@ -235,6 +235,9 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
         calibration = calibrate_from_boards(tmp_path)
         assert calibration.lenses["a"].K[0, 0] == 901 and calibration.lenses["a"].size_px == (1280, 720)
         assert calibration.intrinsics["a"].startswith("given; not verified by the footage (9 pictures")
+    write_cameras(tmp_path, [Lens("a", K, distortion, np.eye(3), np.zeros(3), (640, 360))], "easymocap")
+    with pytest.raises(InputError, match="extrinsic/a: is 1280 x 720 px, but its intrinsics are for 640 x 360"):
+        calibrate_from_boards(tmp_path)
     read["intrinsic"] = footage("intrinsic", close_up(0.7))
     assert calibrate_from_boards(tmp_path).intrinsics["a"].startswith("from intrinsic/: 20 pictures")
 

@@ -125,6 +125,13 @@ def test_inconsistent_colmap_models_are_refused(old: str, new: str, message: str
         Colmap(tmp_path).lenses()
 
 
+def test_a_colmap_lens_with_a_fourth_radial_term_is_refused(tmp_path: Path) -> None:
+    simple, full = "SIMPLE_RADIAL 640 480 500 320 240 0.1", "FULL_OPENCV 640 480 500 500 320 240 0 0 0 0 0 0.1 0 0"
+    (write_model(tmp_path) / "sparse" / "0" / "cameras.txt").write_text(CAMERAS_TXT.replace(simple, full))
+    with pytest.raises(InputError, match=r"cameras\.txt: camera 1: k4 to k6 are not supported"):
+        Colmap(tmp_path).lenses()
+
+
 @pytest.mark.parametrize(
     ("layout", "reader"),
     [("colmap", Colmap), ("caliscope", Caliscope), ("aniposelib", Caliscope), ("easymocap", EasyMocap)],

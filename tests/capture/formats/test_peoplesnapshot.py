@@ -117,13 +117,21 @@ def test_impossibly_distant_poses_are_refused(folder: Path, tmp_path: Path) -> N
 
 
 def test_damaged_files_are_named(folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with h5py.File(folder / "reconstructed_poses.hdf5", "r+") as file:
+    out, poses = tmp_path / "out", folder / "reconstructed_poses.hdf5"
+    rec.write_video(folder / "other.mp4", 6)
+    assert "female-1: 2 videos .mp4; leave exactly one" in rec.refusal(folder, out)
+    (folder / "other.mp4").unlink()
+    for moves, betas, what in ((5, 10, "6 poses, 5 translations"), (6, 9, "9 betas are not SMPL's")):
+        write_hdf5(poses, pose=np.zeros((6, 72)), trans=np.zeros((moves, 3)), betas=np.zeros(betas))
+        assert f"reconstructed_poses.hdf5: {what}" in rec.refusal(folder, out)
+    with h5py.File(poses, "r+") as file:
         del file["betas"]
         file["betas"] = h5py.ExternalLink("/etc/hostname", "betas")
     assert "reconstructed_poses.hdf5: has no array of numbers called betas" in rec.refusal(folder, out)
     write_hdf5(folder / "masks.hdf5", masks=np.zeros((5, 48, 64), np.uint8))
     assert "masks.hdf5: 5 masks for 6 frames" in rec.refusal(folder, out)
+    write_hdf5(folder / "masks.hdf5", masks=np.zeros((6, 48), np.uint8))
+    assert "masks.hdf5: masks are not images (N, H, W)" in rec.refusal(folder, out)
     (folder / "masks.hdf5").write_bytes(b"nothing")
     assert "masks.hdf5: not a readable HDF5 file" in rec.refusal(folder, out)
     write_hdf5(folder / "keypoints.hdf5", keypoints=np.full((6, 54), np.nan))

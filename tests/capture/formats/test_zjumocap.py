@@ -92,6 +92,9 @@ def test_training_cameras_are_those_of_published_work(tmp_path: Path) -> None:
 
 def test_damaged_files_are_named(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
+    (folder / "params").mkdir()
+    np.save(folder / "params" / "1.npy", {"poses": np.zeros(72)}, allow_pickle=True)  # type: ignore[arg-type]
+    assert "1.npy: no poses, Rh, Th and shapes of SMPL" in rec.refusal(folder, out)
     write_parameters(folder / "params" / "1.npy", np.zeros(10))
     assert "1.npy: 10 turns and 10 shape values are not SMPL's" in rec.refusal(folder, out)
     for name, value, what in (
@@ -110,6 +113,9 @@ def test_damaged_files_are_named(folder: Path, tmp_path: Path) -> None:
         row["ims"] = [row["ims"][0], f"../secret/{frame:06d}.jpg"]
     np.save(folder / "annots.npy", annotations, allow_pickle=True)
     assert "leaves the capture folder" in rec.refusal(folder, out)
+    del annotations["cams"]["T"]
+    np.save(folder / "annots.npy", annotations, allow_pickle=True)
+    assert "annots.npy: camera Camera_B1: K, D, R or T is missing" in rec.refusal(folder, out)
     np.save(folder / "annots.npy", {"cams": {}, "ims": []}, allow_pickle=True)  # type: ignore[arg-type]
     assert "annots.npy: 'ims' does not list images" in rec.refusal(folder, out)
 
