@@ -1,7 +1,6 @@
 """Fields trained with one camera held out: the inputs of their fit and training, and their scores."""
 
 import dataclasses
-import inspect
 import json
 import sys
 from pathlib import Path
@@ -18,8 +17,8 @@ from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.config import load_settings
 from tasks.calibration import calibrated_capture
-from tasks.stage import Stage
 from tasks.store import Artifact
+from tests.flows.test_train_subject import STAGES, replace_stages
 from tests.study.recording import ROTATIONS, write_recording
 
 CAMERAS = tuple(ROTATIONS)  # 01, 02, 03
@@ -37,28 +36,21 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any
     real."""
     made: list[dict[str, Any]] = []
 
-    def spied(stage: Stage[Any]) -> Stage[Any]:
-        def write(out: Path, **inputs: Any) -> dict[str, float]:
-            made.append({"stage": stage.name} | inputs)
-            if stage.name == "capture":
-                write_three(out)
-            elif stage.name == "calibration":
-                cameras = Capture.load(inputs["recording"].root).cameras
-                write_easymocap(out, [pinhole(camera) for camera in cameras.values()])
-                (out / "report.json").write_text(json.dumps({"cameras": {n: {"frame_offset": 0.0} for n in cameras}}))
-            else:
-                (out / "made").write_text(str(len(made)))
-            settings = {"static": False, "training": load_settings("fast").training.model_dump()}
-            (out / "settings.json").write_text(json.dumps(settings))
-            return {}
+    def write(stage: str, out: Path, **inputs: Any) -> dict[str, float]:
+        made.append({"stage": stage} | inputs)
+        if stage == "capture":
+            write_three(out)
+        elif stage == "calibration":
+            cameras = Capture.load(inputs["recording"].root).cameras
+            write_easymocap(out, [pinhole(camera) for camera in cameras.values()])
+            (out / "report.json").write_text(json.dumps({"cameras": {n: {"frame_offset": 0.0} for n in cameras}}))
+        else:
+            (out / "made").write_text(str(len(made)))
+        settings = {"static": False, "training": load_settings("fast").training.model_dump()}
+        (out / "settings.json").write_text(json.dumps(settings))
+        return {}
 
-        write.__signature__ = inspect.signature(stage.write)  # type: ignore[attr-defined]
-        return Stage(write, stage.name, "test", resumable=False)
-
-    stages = {"ingest", "calibrate", "segment", "fit", "train", "evaluate", "evaluate_held_out", "export"}
-    for place in (preparation, module):
-        for name in stages & set(vars(place)):
-            monkeypatch.setattr(place, name, spied(getattr(place, name)))
+    replace_stages(monkeypatch, (*STAGES, "evaluate_held_out"), write)
     monkeypatch.setattr(preparation, "needs_body", lambda *_: True)
     monkeypatch.setattr(preparation, "needs_detection", lambda *_: False)
     monkeypatch.setattr(preparation, "needs_hands", lambda *_: False)

@@ -2,6 +2,8 @@
 
 import inspect
 import json
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -25,21 +27,9 @@ STAGES = ("ingest", "detect", "find_hands", "calibrate", "segment", "fit", "trai
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Write a capture folder and replace every stage of the flow."""
-    for place in (preparation, module):
-        for name in set(STAGES) & set(vars(place)):
-            monkeypatch.setattr(place, name, _recording(getattr(place, name), tmp_path))
-    monkeypatch.setattr(preparation, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
-    monkeypatch.setattr(preparation, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
-    monkeypatch.setattr(preparation, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
-    (tmp_path / "ada").mkdir()
-    return tmp_path / "ada"
+    """Write a capture folder and replace every stage of the flow by one that records its input artifacts."""
 
-
-def _recording(stage: Stage[Any], tmp_path: Path) -> Stage[Any]:
-    """Return a fake stage with the same name and parameters, which records its input artifacts."""
-
-    def write(out: Path, **inputs: Any) -> dict[str, float]:
+    def write(_: str, out: Path, **inputs: Any) -> dict[str, float]:
         still = load_settings("idr" if (tmp_path / "ada" / "still").exists() else "fast").training
         (out / "settings.json").write_text(json.dumps({"static": False, "training": still.model_dump()}))
         (out / "given.json").write_text(json.dumps([v.stage for v in inputs.values() if isinstance(v, Artifact)]))
@@ -47,8 +37,22 @@ def _recording(stage: Stage[Any], tmp_path: Path) -> Stage[Any]:
         Capture("ada", out, {"1": camera}, ("1",), (), (0,), (), 25.0, "z", {"1": (4, 4)}, {"1": (4, 4)}).save()
         return {}
 
-    write.__signature__ = inspect.signature(stage.write)  # type: ignore[attr-defined]
-    return Stage(write, stage.name, "test", resumable=False)
+    replace_stages(monkeypatch, STAGES, write)
+    monkeypatch.setattr(preparation, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
+    monkeypatch.setattr(preparation, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
+    monkeypatch.setattr(preparation, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
+    (tmp_path / "ada").mkdir()
+    return tmp_path / "ada"
+
+
+def replace_stages(patch: pytest.MonkeyPatch, names: Iterable[str], write: Callable[..., dict[str, float]]) -> None:
+    """Replace stages by fakes of the same name and parameters, which call `write` with that name first."""
+    for place in (preparation, module):
+        for name in set(names) & set(vars(place)):
+            stage = getattr(place, name)
+            fake = partial(write, stage.name)
+            fake.__signature__ = inspect.signature(stage.write)  # type: ignore[attr-defined]
+            patch.setattr(place, name, Stage(fake, stage.name, "test"))
 
 
 def given(subject: Path, stage: str) -> list[str]:
