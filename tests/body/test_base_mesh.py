@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,9 @@ from hnerf.asset.quads import polygon_corners
 from hnerf.asset.texture import UvLayout, rasterise
 from hnerf.body.anny import ADULT, anny_rig
 from hnerf.body.base_mesh import BaseMesh, base_mesh
+from hnerf.body.physiques import physiques_m
+from hnerf.body.rig import Rig
+from tests.asset.figure import column_rig
 
 
 @pytest.fixture(scope="module")
@@ -75,3 +80,13 @@ def test_texture_coordinates_neither_overlap_nor_mirror_and_favour_the_head(show
     on_head = head[shown.rig.faces].all(1).numpy()
     assert 0.15 < area[on_head].sum() / area.sum() < 0.5
     assert area[shown.skin_faces :].sum() > 0.005
+
+
+def test_face_units_and_physiques_do_not_move_eyeballs_and_exist_only_for_anny(rig: Rig) -> None:
+    base, skin = base_mesh(rig), len(rig.vertices_m)
+    for moved_m in (base.face_units_m["eyeLookDownLeft"], base.physiques_m["slim"]):
+        assert moved_m.shape == (len(base.rig.vertices_m), 3) and not moved_m[skin:].any()
+    np.testing.assert_array_equal(base.physiques_m["slim"][:skin], physiques_m(rig)["slim"])
+    renamed = dataclasses.replace(rig, beta_names=tuple(f"b{k}" for k in range(len(rig.beta))))
+    column = base_mesh(column_rig())
+    assert column.face_units_m == column.physiques_m == base_mesh(renamed).physiques_m == {}

@@ -3,10 +3,8 @@ import pytest
 import torch
 
 from hnerf.body.anny import ADULT, anny_rig
-from hnerf.body.base_mesh import base_mesh
 from hnerf.body.face_units import face_units_m
 from hnerf.body.rig import Rig
-from tests.asset.figure import column_rig
 
 
 def test_face_units_have_arkit_names_and_all_move_vertices(rig: Rig) -> None:
@@ -40,10 +38,3 @@ def test_displacements_scale_with_the_size_of_the_face(rig: Rig) -> None:
     scale = childs[adults[:, 2].argmin(), 2] / adults[:, 2].min()
     assert scale == pytest.approx(widths_m[1] / widths_m[0], rel=0.1) and scale < 0.95
     np.testing.assert_allclose(childs, scale * adults, atol=1e-7)
-
-
-def test_face_units_do_not_move_eyeballs_and_exist_only_for_anny(rig: Rig) -> None:
-    base = base_mesh(rig)
-    assert base.face_units_m["jawOpen"].shape == (len(base.rig.vertices_m), 3)
-    assert not base.face_units_m["eyeLookDownLeft"][len(rig.vertices_m) :].any()
-    assert base_mesh(column_rig()).face_units_m == {}

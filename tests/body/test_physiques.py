@@ -1,14 +1,10 @@
-import dataclasses
-
 import numpy as np
 import torch
 
 from hnerf.asset.extreme_poses import moved_by
 from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
-from hnerf.body.base_mesh import base_mesh
 from hnerf.body.physiques import physiques_m
 from hnerf.body.rig import Rig
-from tests.asset.figure import column_rig
 
 
 def test_physiques_match_their_names_at_belly_and_thighs(rig: Rig) -> None:
@@ -46,13 +42,3 @@ def test_physiques_depend_on_age_but_not_on_muscle_weight_or_local_changes(rig: 
     beta[BETA_NAMES.index("age")] = 0.4
     child_m = physiques_m(anny_rig(beta))["heavy"]
     assert np.abs(child_m).max() < 0.9 * np.abs(physiques_m(rig)["heavy"]).max()
-
-
-def test_physiques_do_not_move_eyeballs_and_exist_only_for_anny(rig: Rig) -> None:
-    base = base_mesh(rig)
-    assert base.physiques_m["slim"].shape == (len(base.rig.vertices_m), 3)
-    assert not base.physiques_m["slim"][len(rig.vertices_m) :].any()
-    np.testing.assert_array_equal(base.physiques_m["slim"][: len(rig.vertices_m)], physiques_m(rig)["slim"])
-    assert base_mesh(column_rig()).physiques_m == {}
-    renamed = dataclasses.replace(rig, beta_names=tuple(f"b{k}" for k in range(len(rig.beta))))
-    assert base_mesh(renamed).physiques_m == {}
