@@ -58,11 +58,11 @@ def test_the_next_region_is_around_the_palm() -> None:
 
 
 def test_points_are_mapped_from_the_crop_to_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a region of 448 px, a crop pixel is 2 px: (112, 112) is its centre, (0, 0) its corner."""
+    """In a region of 448 px, a crop pixel is 2 px: (112, 112) is its centre, (0, 0) its corner. A white pixel is 1."""
     raw = np.full((21, 3), 112.0)
     raw[4] = 0, 0, 5
-    monkeypatch.setattr(hands, "Network", lambda name: lambda image: [raw.ravel(), np.array([0.7])])
-    points = HandNetwork()(IMAGE, Region(np.array([300.0, 400.0]), 448.0, 0.0))
+    monkeypatch.setattr(hands, "Network", lambda name: lambda image: [raw.ravel(), [0.7 * image.max()]])
+    points = HandNetwork()(IMAGE + np.uint8(255), Region(np.array([300.0, 400.0]), 448.0, 0.0))
     assert points[0] == pytest.approx([300, 400, 0.7]) and points[4] == pytest.approx([76, 176, 0.7])
 
 

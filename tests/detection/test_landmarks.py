@@ -11,6 +11,7 @@ from hnerf.detection.landmarks import LandmarkNetwork, refine_by_heatmap
 from hnerf.detection.region import Region
 
 SURE = 60.0  # a logit of practically 1
+WHITE = np.full((800, 600, 3), 255, np.uint8)
 
 
 def answers(presence: float = 0.9) -> list[np.ndarray]:
@@ -30,14 +31,15 @@ def answers(presence: float = 0.9) -> list[np.ndarray]:
 
 @pytest.fixture
 def network(monkeypatch: pytest.MonkeyPatch) -> LandmarkNetwork:
-    monkeypatch.setattr(landmarks, "Network", lambda name: lambda image: answers())
+    """Return a network that finds a person only in images scaled to at most 1."""
+    monkeypatch.setattr(landmarks, "Network", lambda name: lambda image: answers(0.9 if image.max() == 1 else 0.0))
     return LandmarkNetwork("heavy")
 
 
 def test_points_are_mapped_from_the_crop_to_the_image(network: LandmarkNetwork) -> None:
     """In a region of 512 px around (300, 400), a crop pixel is 2 px. The wrist is 64 crop pixels left of the centre and
     64 below it, at (172, 528). The next region is around (300, 464), 2.5 x 128 px wide."""
-    person = network(np.zeros((800, 600, 3), np.uint8), Region(np.array([300.0, 400.0]), 512.0, 0.0))
+    person = network(WHITE, Region(np.array([300.0, 400.0]), 512.0, 0.0))
     assert person is not None
     assert person.points_px.shape == (33, 3)
     assert person.points_px[16] == pytest.approx([172, 528, 0.5])
@@ -52,7 +54,7 @@ def test_points_are_mapped_from_the_crop_to_the_image(network: LandmarkNetwork) 
 def test_a_turned_region_turns_points_and_metres(network: LandmarkNetwork) -> None:
     """A turn by 90 degrees clockwise takes left to up and down to left: 128 px up and 128 px left of the centre. (0.3,
     -0.2) becomes (0.2, 0.3)."""
-    person = network(np.zeros((800, 600, 3), np.uint8), Region(np.array([300.0, 400.0]), 512.0, math.pi / 2))
+    person = network(WHITE, Region(np.array([300.0, 400.0]), 512.0, math.pi / 2))
     assert person is not None
     assert person.points_px[16, :2] == pytest.approx([172, 272])
     assert person.points_m[16] == pytest.approx([0.2, 0.3, 0.1])

@@ -36,9 +36,8 @@ def places(people: list[Person]) -> list[float]:
 
 def test_a_person_who_moves_little_is_tracked_without_new_detection() -> None:
     scene, images = Scene(), [np.array([[8.0 * i, 0.0]]) for i in range(REDETECT_EVERY)]
-    assert [places(people) for people in track(images, scene.detector, scene.landmarks)] == [
-        [8.0 * i] for i in range(10)
-    ]
+    found = [places(people) for people in track(images, scene.detector, scene.landmarks)]
+    assert found == [[8.0 * i] for i in range(10)]
     assert scene.detections == 1 and scene.landmarked == len(images)
 
 
@@ -56,13 +55,18 @@ def test_landmarks_are_found_twice_for_a_person_who_moves_far() -> None:
     assert people[0].region.centre_px == pytest.approx([30, 0])
 
 
+def test_landmarks_of_a_person_who_is_always_elsewhere_are_found_three_times() -> None:
+    scene = Scene()
+    next(track([np.zeros((1, 2))], scene.detector, lambda _, at: scene.landmarks(at.centre_px[None] + 20, at)))
+    assert scene.landmarked == 3
+
+
 def test_a_person_who_enters_later_is_found_once_and_nobody_twice() -> None:
-    scene, images = (
-        Scene(),
-        [np.array([[0.0, 0.0], [300.0, 0.0]][: 1 if i < 3 else 2]) for i in range(REDETECT_EVERY + 2)],
-    )
+    """Landmarks are not searched for where the detector finds the first person again."""
+    scene, both = Scene(), np.array([[100.0, 0.0], [300.0, 0.0]])
+    images = [both[:1] if i < 3 else both for i in range(REDETECT_EVERY + 2)]
     counts = [len(people) for people in track(images, scene.detector, scene.landmarks)]
-    assert counts == [1] * REDETECT_EVERY + [2, 2]
+    assert counts == [1] * REDETECT_EVERY + [2, 2] and scene.landmarked == REDETECT_EVERY + 4
 
 
 def test_detection_runs_in_every_image_while_a_person_is_missing() -> None:
