@@ -2,21 +2,24 @@
 
 import json
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 from torch import Tensor
 
 from hnerf.avatar.avatar import Rendering
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import Rig
 from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks, encode
+from hnerf.evaluation import geometry
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.geometry.camera import Camera
+from tests.body.boxes import hinged
 
 RADIUS_M = 0.1
 SIZE_PX = 64
@@ -78,30 +81,16 @@ def ball_camera(name: str, turn_deg: float) -> Camera:
 
 
 def ball_fit() -> BodyFit:
-    """Return the ball as a body of one joint."""
+    """Return the ball as a body whose second joint moves nothing."""
     ball = trimesh.creation.icosphere(3, RADIUS_M)
-    count = len(ball.vertices)
-    rig = Rig(
-        vertices_m=torch.tensor(ball.vertices, dtype=torch.float32),
-        faces=torch.tensor(ball.faces, dtype=torch.long),
-        joints_m=torch.zeros(1, 3),
-        joint_names=("root",),
-        parents=torch.tensor([-1]),
-        beta=torch.zeros(0),
-        beta_names=(),
-        shape_basis=torch.zeros(0, count, 3),
-        joint_basis=torch.zeros(0, 1, 3),
-        skin_joints=torch.zeros(count, 1, dtype=torch.long),
-        skin_weights=torch.ones(count, 1),
-        free=torch.zeros(1, dtype=torch.bool),
-        keypoint_weights=torch.zeros(25, count),
-    )
+    vertices_m, faces = torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces).long()
+    rig = hinged(vertices_m, faces, torch.zeros(2, 3), ("root", "other"), torch.zeros(len(vertices_m)))
     root = torch.eye(4).repeat(len(FRAMES), 1, 1)
     root[:, :3, 3] = torch.tensor(np.stack([centre_m(f) for f in FRAMES]), dtype=torch.float32)
-    return BodyFit(rig, FRAMES, torch.zeros(len(FRAMES), 1, 3), root)
+    return BodyFit(rig, FRAMES, torch.zeros(len(FRAMES), 2, 3), root)
 
 
-def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -> Capture:
+def write_ball_capture(folder: Path, test_cameras: tuple[str, ...] = ("c",), name: str = "ball") -> Capture:
     """Write images of a ball on grey from cameras "a", "b" and the test cameras, and a `capture.toml` as in
     recordings."""
     names = ("a", "b", *test_cameras)
@@ -119,12 +108,14 @@ def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -
     return capture
 
 
-def write_ball_truth(capture: Capture, radius_m: float) -> None:
-    """Write `ground_truth/` with exact masks of every view, and for frame 0 a true surface with another radius."""
+def write_ball_truth(capture: Capture, radius_m: float | None = RADIUS_M, masked: tuple[int, ...] = FRAMES) -> None:
+    """Write `ground_truth/` with exact masks of frames and, if a radius is given, a true surface for frame 0."""
     for camera in capture.cameras.values():
-        for frame in FRAMES:
+        for frame in masked:
             mask = ball_mask(camera, centre_m(frame)).astype(np.uint8) * 255
             write_image(capture.root / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", mask)
+    if radius_m is None:
+        return
     ball = trimesh.creation.icosphere(5, radius_m)
     vertices = (ball.vertices + centre_m(0))[None].astype(np.float32)
     path = capture.root / "ground_truth" / "meshes.npz"
@@ -154,9 +145,17 @@ def write_settings(training: Path, kind: str = "fast", nodes: int = 8, steps: in
     (training / "settings.json").write_text(json.dumps({"static": False, "training": settings}))
 
 
-def ball_inputs(capture: Capture, stages: Path) -> EvaluationInputs:
-    """Return all inputs of evaluation; `stages` gets a folder for each earlier stage."""
-    fit = ball_fit()
+def coarse_surfaces(patch: pytest.MonkeyPatch) -> None:
+    """Extract and compare surfaces on coarse grids, fine enough for the values worked out by hand, and draw small
+    images of them."""
+    patch.setattr("hnerf.avatar.surface.POSED_CELLS", 96)
+    patch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (75, 100))
+    patch.setattr(geometry, "score_geometry", partial(geometry.score_geometry, samples=10_000, nodes=64))
+
+
+def ball_inputs(capture: Capture) -> EvaluationInputs:
+    """Return all inputs of evaluation, with a new folder for each earlier stage."""
+    fit, stages = ball_fit(), capture.root / "stages"
     folders = {f"{name}_folder": stages / name for name in ("calibration", "segmentation", "fit", "training")}
     for folder in folders.values():
         folder.mkdir(parents=True)

@@ -38,6 +38,7 @@ from tests.evaluation.ball import (
     ball_inputs,
     ball_mask,
     centre_m,
+    coarse_surfaces,
     tuned,
     write_ball_capture,
     write_ball_masks,
@@ -54,11 +55,8 @@ HOSTILE = "<script>alert(1)</script>"
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse_meshes() -> Iterator[None]:
-    """Extract surfaces on a coarse grid, fine enough for the values worked out by hand, and draw small images of them,
-    which no test looks at."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("hnerf.avatar.surface.POSED_CELLS", 96)
-        patched.setattr("hnerf.evaluation.pictures.PICTURE_PX", (75, 100))
+        coarse_surfaces(patched)
         yield
 
 
@@ -66,9 +64,9 @@ def coarse_meshes() -> Iterator[None]:
 def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
     """Evaluate a subject with ground truth and one test camera; write the evaluation next to its capture."""
     base = tmp_path_factory.mktemp("scored")
-    capture = write_ball_capture(base / "capture", "ball", ("c",))
+    capture = write_ball_capture(base / "capture")
     write_ball_truth(capture, RADIUS_M + GAP_M)
-    inputs = ball_inputs(capture, base / "stages")
+    inputs = ball_inputs(capture)
     avatar = BallAvatar(tuned(inputs.fitted), PHOTOGRAPHED, PHOTOGRAPHED - RENDERED)
     inputs = dataclasses.replace(inputs, avatar=avatar)
     history = [{"step": k, "seconds": 2.0 * k, "losses": {"rec": 0.1}, "held_out": {"psnr": 20.0 + k}} for k in (0, 1)]
@@ -86,7 +84,7 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
 def unscored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
     """Evaluate a subject without ground truth or test cameras, whose name contains markup."""
     base = tmp_path_factory.mktemp("unscored")
-    return evaluated(base, ball_inputs(write_ball_capture(base / "capture", HOSTILE, ()), base / "stages"))
+    return evaluated(ball_inputs(write_ball_capture(base / "capture", (), HOSTILE)))
 
 
 def test_image_scores_by_hand(scored: Scored) -> None:
@@ -105,21 +103,17 @@ def test_image_scores_by_hand(scored: Scored) -> None:
 
 
 def test_the_report_may_show_more_images_than_are_scored(tmp_path: Path) -> None:
-    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
-    write_ball_truth(capture, RADIUS_M)
-    (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
-    out, found = evaluated(tmp_path, ball_inputs(capture, tmp_path / "stages"), max_images=1, report_rows=3)
+    capture = write_ball_capture(tmp_path / "capture")
+    write_ball_truth(capture, None)  # surfaces are scored elsewhere
+    out, found = evaluated(ball_inputs(capture), max_images=1, report_rows=3)
     assert found["novel_view"]["n"] == 1 and (out / "report.html").is_file()
 
 
 def test_scored_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> None:
     """Of frames 0 to 2, only frame 1 has a mask, so it is chosen instead of the first and the last."""
-    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
-    write_ball_truth(capture, RADIUS_M)
-    (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
-    for frame in (0, 2):
-        (capture.root / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
-    _, found = unreported(tmp_path, capture, max_images=2)
+    capture = write_ball_capture(tmp_path / "capture")
+    write_ball_truth(capture, None, masked=(1,))
+    _, found = unreported(capture, max_images=2)
     assert [row["frame"] for row in found["novel_view"]["per_image"]] == [1]
 
 
@@ -171,12 +165,7 @@ def test_a_rendering_that_cannot_be_written_raises_an_error(tmp_path: Path) -> N
     view = View("novel_view", "c", 1)
     view.path(tmp_path).mkdir(parents=True)
     with pytest.raises(OSError, match=r"000001\.png: cannot be written"):
-        render(
-            {"novel_view": BallAvatar(ball_fit())},
-            write_ball_capture(tmp_path / "capture", "ball", ("c",)),
-            [view],
-            tmp_path,
-        )
+        render({"novel_view": BallAvatar(ball_fit())}, write_ball_capture(tmp_path / "capture"), [view], tmp_path)
 
 
 def test_without_ground_truth_scores_are_null_with_a_reason(unscored: Scored) -> None:
@@ -224,20 +213,20 @@ def test_the_report_shows_all_three_novel_pose_columns_side_by_side(scored: Scor
     assert "not trained on, in poses as fitted before training" in text
 
 
-def evaluated(base: Path, inputs: EvaluationInputs, **settings: Any) -> Scored:
-    """Evaluate a ball; return the output folder and the metrics."""
-    out = base / "evaluation"
+def evaluated(inputs: EvaluationInputs, **settings: Any) -> Scored:
+    """Evaluate a ball; return the output folder, next to its capture, and the metrics."""
+    out = inputs.capture_folder.with_name("evaluation")
     out.mkdir()
     return out, evaluate(inputs, EvaluationSettings(**{"max_meshes": 1, "report_rows": 1} | settings), out)
 
 
-def unreported(base: Path, capture: Capture, kind: str = "fast", **settings: Any) -> Scored:
+def unreported(capture: Capture, kind: str = "fast", **settings: Any) -> Scored:
     """Evaluate a ball trained with a kind of field, without writing a report."""
-    inputs = ball_inputs(capture, base / "stages")
+    inputs = ball_inputs(capture)
     write_settings(inputs.training_folder, kind)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "write_report", lambda *_: None)
-        return evaluated(base, inputs, **settings)
+        return evaluated(inputs, **settings)
 
 
 class Mist(BallAvatar):
@@ -248,10 +237,10 @@ class Mist(BallAvatar):
 
 
 def test_a_field_without_a_surface_is_scored_on_images_and_gives_a_reason(tmp_path: Path) -> None:
-    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
-    write_ball_truth(capture, RADIUS_M)
-    inputs = ball_inputs(capture, tmp_path / "stages")
-    out, _ = evaluated(tmp_path, dataclasses.replace(inputs, avatar=Mist(inputs.fitted)))
+    capture = write_ball_capture(tmp_path / "capture")
+    write_ball_truth(capture)
+    inputs = ball_inputs(capture)
+    out, _ = evaluated(dataclasses.replace(inputs, avatar=Mist(inputs.fitted)))
     found = json.loads((out / "metrics.json").read_text())
     reason = "no surface in its box (everything is outside)"
     for split in ("novel_view", "novel_pose"):
@@ -261,7 +250,7 @@ def test_a_field_without_a_surface_is_scored_on_images_and_gives_a_reason(tmp_pa
 
 
 def test_a_method_without_tuning_has_one_novel_pose_column(tmp_path: Path) -> None:
-    out, found = unreported(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "neural_body")
+    out, found = unreported(write_ball_capture(tmp_path / "capture"), "neural_body")
     assert found["novel_pose_posed"]["reason"] == "no pose of these frames was tuned"
     assert found["novel_pose_tracked"]["reason"] == "these frames have no deformation of their own"
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_pose", "novel_view", "training_view"]
@@ -272,9 +261,9 @@ def test_a_method_without_tuning_has_one_novel_pose_column(tmp_path: Path) -> No
 def test_test_cameras_without_truth_are_scored_with_the_recordings_masks(tmp_path: Path) -> None:
     """Of two test cameras only c has masks, which lack the left half of the ball. Scores follow from that, for a
     uniform rendering."""
-    capture = write_ball_capture(tmp_path / "capture", "ball", ("c", "d"))
+    capture = write_ball_capture(tmp_path / "capture", ("c", "d"))
     write_ball_masks(capture, "c")
-    out, found = evaluated(tmp_path, ball_inputs(capture, tmp_path / "stages"))
+    out, found = evaluated(ball_inputs(capture))
     whole = ball_mask(TEST_CAMERA, centre_m(3))
     half = whole & (np.arange(whole.shape[1]) >= whole.shape[1] // 2)
     error = (whole * RENDERED / 255 - half * PHOTOGRAPHED / 255)[mask_box(half)]
@@ -291,9 +280,9 @@ def test_test_cameras_without_truth_are_scored_with_the_recordings_masks(tmp_pat
 
 
 def test_true_masks_take_precedence_over_the_recordings_masks(tmp_path: Path) -> None:
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    capture = write_ball_capture(tmp_path)
     write_ball_masks(capture, "c")
-    write_ball_truth(capture, RADIUS_M)
+    write_ball_truth(capture)
     truth = truth_of(tmp_path, capture)
     assert truth.on_black("c", 0)[1] == MASKED_IMAGE and protocol_of(truth) == PROTOCOL
     shutil.rmtree(tmp_path / "ground_truth" / "masks" / "c")  # masks of training cameras stay
@@ -302,13 +291,13 @@ def test_true_masks_take_precedence_over_the_recordings_masks(tmp_path: Path) ->
 
 
 def test_masks_of_training_cameras_are_not_used_for_scores(tmp_path: Path) -> None:
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    capture = write_ball_capture(tmp_path)
     write_ball_masks(capture, "a")
     assert not truth_of(tmp_path, capture).has_masks
 
 
 def test_a_method_without_poses_renders_no_novel_poses(tmp_path: Path) -> None:
-    out, found = unreported(tmp_path, write_ball_capture(tmp_path / "capture", "ball", ("c",)), "nerfies")
+    out, found = unreported(write_ball_capture(tmp_path / "capture"), "nerfies")
     assert "Nerfies has no pose to set" in found["novel_pose"]["reason"]
     assert "Nerfies has no pose to set" in found["novel_pose"]["geometry_reason"]
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_view", "training_view"]
@@ -317,9 +306,9 @@ def test_a_method_without_poses_renders_no_novel_poses(tmp_path: Path) -> None:
 
 def test_pixels_of_training_cameras_are_never_scored(tmp_path: Path) -> None:
     """This holds although every image has ground truth."""
-    capture = write_ball_capture(tmp_path / "capture", "ball", ())
-    write_ball_truth(capture, RADIUS_M)
-    out, found = unreported(tmp_path, capture)
+    capture = write_ball_capture(tmp_path / "capture", ())
+    write_ball_truth(capture)
+    out, found = unreported(capture)
     for split in ("novel_view", "novel_pose", "novel_pose_posed", "novel_pose_tracked"):
         assert (found[split]["n"], found[split]["psnr"], found[split]["per_image"]) == (0, None, [])
     assert "evaluation.holdout" in found["novel_pose"]["reason"]

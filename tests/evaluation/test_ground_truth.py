@@ -16,8 +16,8 @@ MASK = "ground_truth/masks/c/000001.png"
 
 @pytest.fixture
 def truth(tmp_path: Path) -> GroundTruth:
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
-    write_ball_truth(capture, 0.1)
+    capture = write_ball_capture(tmp_path)
+    write_ball_truth(capture)
     return GroundTruth(tmp_path, capture)
 
 

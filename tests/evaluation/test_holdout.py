@@ -25,6 +25,7 @@ from tests.evaluation.ball import (
     ball_inputs,
     ball_mask,
     centre_m,
+    coarse_surfaces,
     tuned,
     write_ball_capture,
     write_ball_truth,
@@ -36,7 +37,7 @@ CAMERAS = ("a", "b", "c")
 
 def three_cameras(folder: Path) -> Capture:
     """Return a capture with three training cameras."""
-    capture = write_ball_capture(folder, "ball", ("c",))
+    capture = write_ball_capture(folder)
     return replace(capture, train_cameras=CAMERAS, test_cameras=())
 
 
@@ -71,7 +72,7 @@ def psnr_db(capture: Capture, camera: str, frame: int, grey: int) -> float:
 def test_a_held_out_camera_is_scored_on_its_own_masked_photographs(tmp_path: Path) -> None:
     """The ground truth says otherwise and is ignored. Training frames are rendered as trained, novel poses animated."""
     capture = three_cameras(tmp_path / "capture")
-    write_ball_truth(capture, 0.1)
+    write_ball_truth(capture)
     out, found = held_out(tmp_path, capture, "b")
     assert (found["camera"], found["trained_on"]) == ("b", ["a", "c"])
     assert [(r["camera"], r["frame"]) for r in found["novel_view"]["per_image"]] == [("b", 0), ("b", 2)]
@@ -104,11 +105,10 @@ def test_held_out_scores_are_collected_by_camera_with_their_mean(tmp_path: Path)
 
 
 def test_the_report_has_a_row_for_each_held_out_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hnerf.avatar.surface.POSED_CELLS", 96)  # surfaces do not matter here
-    monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (75, 100))
+    coarse_surfaces(monkeypatch)  # they do not matter here
     capture = three_cameras(tmp_path / "capture")
     folders = [held_out(tmp_path, capture, camera)[0] for camera in ("a", "b")]
-    inputs = replace(ball_inputs(capture, tmp_path / "stages"), held_out_folders=tuple(folders))
+    inputs = replace(ball_inputs(capture), held_out_folders=tuple(folders))
     found = evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1), tmp_path)
     text = (tmp_path / "report.html").read_text()
     assert f"{found['holdout']['mean']['novel_pose']['psnr']:.2f}" in text and LABEL in text.replace("&#39;", "'")

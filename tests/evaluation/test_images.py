@@ -12,7 +12,7 @@ from hnerf.evaluation import images as module
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.images import mean_of, render, rgba, score_split
 from hnerf.evaluation.views import View
-from tests.evaluation.ball import RADIUS_M, BallAvatar, ball_fit, write_ball_capture, write_ball_truth
+from tests.evaluation.ball import BallAvatar, ball_fit, write_ball_capture, write_ball_truth
 
 
 def test_renderings_are_rgba_with_colour_over_black(tmp_path: Path) -> None:
@@ -41,8 +41,8 @@ def test_an_image_without_alpha_is_refused_as_a_rendering(tmp_path: Path) -> Non
 
 def test_images_without_the_person_are_counted_but_not_scored(tmp_path: Path) -> None:
     """In one of two images, the person has left."""
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
-    write_ball_truth(capture, RADIUS_M)
+    capture = write_ball_capture(tmp_path)
+    write_ball_truth(capture)
     write_image(tmp_path / "ground_truth" / "masks" / "c" / "000001.png", np.zeros((64, 64, 3), np.uint8))
     views = [View("novel_view", "c", frame) for frame in (0, 1)]
     render({"novel_view": BallAvatar(ball_fit())}, capture, views, tmp_path)
@@ -53,7 +53,7 @@ def test_images_without_the_person_are_counted_but_not_scored(tmp_path: Path) ->
 
 def test_rendering_time_is_per_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two images take 12 s."""
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    capture = write_ball_capture(tmp_path)
     clock = iter((100.0, 112.0))
     monkeypatch.setattr(module.time, "perf_counter", lambda: next(clock))
     monkeypatch.setattr(module, "tracked", lambda items, *_: items)  # which reads the clock too

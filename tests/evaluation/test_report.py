@@ -63,13 +63,13 @@ def test_costs_have_a_row_for_each_part_of_a_stage() -> None:
 
 
 def test_costs_include_the_duration_of_the_body_fit(tmp_path: Path) -> None:
-    inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
+    inputs = ball_inputs(write_ball_capture(tmp_path / "capture"))
     stages = stage_reports(replace(inputs, fit_seconds={"start": 0.5}))
     assert costs(stages, {"seconds_per_image": 0.1})[0] == ("Body fit: start, seconds", "0.5")
 
 
 def test_notes_list_unscored_images_and_the_reference(tmp_path: Path) -> None:
-    inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
+    inputs = ball_inputs(write_ball_capture(tmp_path / "capture"))
     view = {"reference": "image x ground-truth mask", "without_mask": 3, "without_person": 2}
     rain = {f"novel_pose{column}": {"reason": "rain"} for column in ("", "_posed", "_tracked")}
     found = {"lpips": "not available: no weights", "novel_view": view} | rain
@@ -84,7 +84,7 @@ def test_notes_list_unscored_images_and_the_reference(tmp_path: Path) -> None:
 
 def test_the_worst_image_of_a_split_is_shown_with_a_label(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The only row of samples shows the split's first frame; the worst image is in another frame."""
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    capture = write_ball_capture(tmp_path)
     for frame in (0, 1, 2):
         write_image(View("novel_view", "c", frame).path(tmp_path), np.zeros((64, 64, 4), np.uint8))
     psnr = {0: 30.0, 1: 20.0, 2: 40.0}
@@ -92,6 +92,6 @@ def test_the_worst_image_of_a_split_is_shown_with_a_label(tmp_path: Path, monkey
     found["novel_view"] = {"per_image": [{"camera": "c", "frame": f, "psnr": db} for f, db in psnr.items()]}
     monkeypatch.setattr(report, "view_row", lambda view, *given: (view.frame, given[3]))
     monkeypatch.setattr(report, "surface_gallery", lambda *_: None)
-    inputs = ball_inputs(capture, tmp_path / "stages")
+    inputs = ball_inputs(capture)
     shown, _ = report.galleries(inputs, EvaluationSettings(report_rows=1), None, {}, found, tmp_path)
     assert shown.rows == [(0, ""), (1, "the worst of this split, 20.0 dB")]

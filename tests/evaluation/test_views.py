@@ -6,27 +6,27 @@ from tests.evaluation.ball import write_ball_capture
 
 
 def test_splits_with_test_cameras(tmp_path: Path) -> None:
-    capture = write_ball_capture(tmp_path, "ball", ("c", "d"))
+    capture = write_ball_capture(tmp_path, ("c", "d"))
     assert all_views(capture, "novel_view") == [View("novel_view", c, f) for c in ("c", "d") for f in (0, 1, 2)]
     for column in ("novel_pose", "novel_pose_posed", "novel_pose_tracked"):
         assert all_views(capture, column) == [View(column, "c", 3), View(column, "d", 3)]
 
 
 def test_splits_without_test_cameras(tmp_path: Path) -> None:
-    capture = write_ball_capture(tmp_path, "ball", ())
+    capture = write_ball_capture(tmp_path, ())
     assert all_views(capture, "novel_view") == []
     assert all_views(capture, "novel_pose") == [View("novel_pose", "a", 3), View("novel_pose", "b", 3)]
 
 
 def test_sampled_views_alternate_between_cameras(tmp_path: Path) -> None:
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    capture = write_ball_capture(tmp_path)
     shown = sample_views(all_views(capture, TRAINING_VIEW), 3)
     assert [(v.camera, v.frame) for v in shown] == [("a", 0), ("b", 1), ("a", 2)]
 
 
 def test_a_single_frame_is_sampled_from_several_cameras(tmp_path: Path) -> None:
     """The ball's only novel frame is seen by three test cameras."""
-    capture = write_ball_capture(tmp_path, "ball", ("c", "d", "e"))
+    capture = write_ball_capture(tmp_path, ("c", "d", "e"))
     poses, views = all_views(capture, "novel_pose"), all_views(capture, "novel_view")
     assert [v.camera for v in sample_views(poses, 3)] == ["c", "d", "e"]
     assert [v.camera for v in sample_views(poses, 2)] == ["c", "e"]

@@ -19,7 +19,7 @@ from tests.evaluation.ball import BallAvatar, ball_fit, write_ball_capture, writ
 def test_test_cameras_without_true_masks_are_scored_with_the_recordings_masks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
+    capture = write_ball_capture(tmp_path / "capture")
     write_ball_masks(capture, "c")
     training = tmp_path / "training"
     training.mkdir()

@@ -28,6 +28,7 @@ from tests.evaluation.ball import (
     ball_fit,
     ball_mask,
     centre_m,
+    coarse_surfaces,
     tuned,
     write_ball_capture,
     write_ball_truth,
@@ -63,13 +64,13 @@ def scored(
     write_settings(training, kind)
     report = {"seconds": 15.0, "field_seconds": 12.0, "peak_memory_gib": 1.5, "model_mib": 7.0}
     (training / "report.json").write_text(json.dumps(report))
-    capture = write_ball_capture(base / "capture", "ball", test_cameras)
+    capture = write_ball_capture(base / "capture", test_cameras)
     write_ball_truth(capture, RADIUS_M + GAP_M)
     out = base / "out"
     out.mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scoring, "load_avatar", lambda path: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
-        patch.setattr("hnerf.avatar.surface.POSED_CELLS", 96)  # enough for a ball
+        coarse_surfaces(patch)
         return score(scene(capture), training, settings, out)
 
 
@@ -112,7 +113,7 @@ def test_the_curve_has_snapshots_at_their_true_times_and_the_end_of_the_field(fo
 
 
 def test_only_the_end_of_a_longer_training_is_scored(base: Path, found: dict[str, Any], tmp_path: Path) -> None:
-    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
+    capture = write_ball_capture(tmp_path / "capture")
     write_ball_truth(capture, RADIUS_M + GAP_M)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scoring, "load_avatar", lambda path: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
@@ -163,8 +164,8 @@ def test_truth_and_rendering_are_written_for_each_chosen_image(base: Path, found
 
 
 def test_an_image_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
-    write_ball_truth(capture, RADIUS_M)
+    capture = write_ball_capture(tmp_path)
+    write_ball_truth(capture)
     render({"novel_view": BallAvatar(ball_fit())}, capture, [View("novel_view", "c", 1)], tmp_path)
     monkeypatch.setattr("cv2.imwrite", lambda *_: False)
     shown = [{"camera": "c", "frame": 1}]
@@ -194,10 +195,8 @@ def test_which_methods_have_no_novel_poses(tmp_path: Path) -> None:
 
 def test_only_images_with_ground_truth_are_chosen(tmp_path: Path) -> None:
     """One of three frames is to be scored, but only the middle one has a mask."""
-    capture = write_ball_capture(tmp_path, "ball", ("c",))
-    write_ball_truth(capture, RADIUS_M)
-    for frame in (0, 2):
-        (tmp_path / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
+    capture = write_ball_capture(tmp_path)
+    write_ball_truth(capture, masked=(1,))
     found = score_views(scene(capture), BallAvatar(ball_fit()), "novel_view", 1, 0, tmp_path)
     assert [row["frame"] for row in found["per_image"]] == [1]
 
