@@ -12,7 +12,7 @@ import torch
 
 from hnerf.avatar.avatar import Rendering
 from hnerf.avatar.finished import reason_without_novel_poses
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, read_rgb
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
@@ -159,8 +159,9 @@ def test_scores_of_images_include_their_distance_from_training(found: dict[str, 
 
 def test_truth_and_rendering_are_written_for_each_chosen_image(base: Path, found: dict[str, Any]) -> None:
     assert found["pictures"] == [{"camera": "c", "frame": 0}, {"camera": "c", "frame": 2}]
-    names = {path.name for path in (base / "out" / "pictures").iterdir()}
-    assert names == {f"{k}-{name}.png" for k in (0, 1) for name in ("render", "truth")}
+    written = {path.name: read_rgb(path) for path in (base / "out" / "pictures").iterdir()}
+    middles = {name: int(picture[picture.shape[0] // 2, picture.shape[1] // 2, 0]) for name, picture in written.items()}
+    assert middles == {f"{k}-{name}.png": grey for k in (0, 1) for name, grey in (("render", 102), ("truth", 153))}
 
 
 def test_an_image_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
