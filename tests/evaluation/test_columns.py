@@ -5,25 +5,7 @@ import pytest
 
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.views import SPLITS
-from tests.evaluation.ball import BallAvatar, ball_fit, tuned, write_settings
-
-
-def test_the_animated_column_uses_neither_tuned_poses_nor_per_frame_changes() -> None:
-    """The grey level shows whether the field was queried for one of its frames, and the ball's position shows which
-    pose it was given."""
-    fit = ball_fit()
-    avatar = BallAvatar(tuned(fit), 100, frames_darken_by=51)
-    k, fitted_m, tuned_m = fit.index(3), fit.root[3, 2, 3].item(), avatar.body.root[3, 2, 3].item()
-    assert fitted_m != tuned_m
-    for split, place_m, darker in (
-        ("novel_view", tuned_m, 51),
-        ("novel_pose", fitted_m, 0),
-        ("novel_pose_posed", tuned_m, 0),
-        ("novel_pose_tracked", tuned_m, 51),
-    ):
-        shown = avatar_for_split(split, avatar, fit)
-        assert isinstance(shown, BallAvatar)
-        assert (shown.body.root[k, 2, 3].item(), shown.frames_darken_by) == (place_m, darker), split
+from tests.evaluation.ball import BallAvatar, ball_fit, write_settings
 
 
 def test_the_animated_column_uses_the_trained_shape() -> None:

@@ -44,7 +44,3 @@ def test_sampled_views_are_spread_over_frames() -> None:
 def test_evenly_spaced_items_include_both_ends() -> None:
     assert evenly_spaced(range(10), 4) == [0, 3, 6, 9]
     assert evenly_spaced((5, 7), 4) == [5, 7]
-
-
-def test_path_of_a_rendering() -> None:
-    assert View("novel_view", "05", 7).path(Path("out")) == Path("out/renders/novel_view/05/000007.png")
