@@ -2,6 +2,7 @@ import dataclasses
 import math
 import os
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -238,46 +239,50 @@ def test_invalid_motion_arrays_are_refused(arrays: dict[str, np.ndarray], messag
         read_motion(tmp_path / "walk.npz")
 
 
-def test_an_impossibly_large_array_shape_is_refused(tmp_path: Path) -> None:
-    """The shape is declared by the header of an intact archive."""
-    with zipfile.ZipFile(tmp_path / "walk.npz", "w") as archive, archive.open("poses.npy", "w") as file:
-        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**30, 156)})
+def in_headers(archive: bytes, at: int, value: int) -> bytes:
+    """Return an archive with another byte in its first local file header and, two bytes further on, in the central
+    directory."""
+    changed = bytearray(archive)
+    for signature, place in ((b"PK\x03\x04", at), (b"PK\x01\x02", at + 2)):
+        changed[changed.index(signature) + place] = value
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: in_headers(whole, 6, 1),
+        lambda whole: in_headers(whole, 8, 99),
+    ],
+    ids=["truncated", "encrypted", "otherwise compressed"],
+)
+def test_an_archive_that_cannot_be_unpacked_is_refused(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    np.savez(tmp_path / "walk.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
+    (tmp_path / "walk.npz").write_bytes(damage((tmp_path / "walk.npz").read_bytes()))
     with pytest.raises(InputError, match=r"walk\.npz: not an \.npz of plain arrays"):
         read_motion(tmp_path / "walk.npz")
 
 
-def test_a_truncated_motion_file_is_refused(tmp_path: Path) -> None:
-    np.savez_compressed(tmp_path / "walk.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
-    whole = (tmp_path / "walk.npz").read_bytes()
-    (tmp_path / "walk.npz").write_bytes(whole[: len(whole) // 2])
+def write_poses(path: Path, frames: int, content: bytes = b"") -> None:
+    """Write an intact archive whose header declares poses of so many frames."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("poses.npy", "w") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (frames, 156)})
+        file.write(content)
+
+
+def test_an_impossibly_large_array_shape_is_refused(tmp_path: Path) -> None:
+    write_poses(tmp_path / "walk.npz", 10**30)
     with pytest.raises(InputError, match=r"walk\.npz: not an \.npz of plain arrays"):
         read_motion(tmp_path / "walk.npz")
 
 
 def test_a_small_file_that_unpacks_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hnerf.render.motion.MAX_MOTION_BYTES", 10_000_000)
-    with (
-        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("poses.npy", "w") as file,
-    ):
-        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10_000, 156)})
-        file.write(bytes(10_000 * 156 * 8))
+    write_poses(tmp_path / "bomb.npz", 10_000, bytes(10_000 * 156 * 8))
     assert (tmp_path / "bomb.npz").stat().st_size < 20_000
     with pytest.raises(InputError, match=r"bomb\.npz: unpacks to 12 MB; at most 10 MB"):
         read_motion(tmp_path / "bomb.npz")
-
-
-@pytest.mark.parametrize(("at", "value"), [(6, 1), (8, 99)])
-def test_an_encrypted_or_otherwise_compressed_archive_is_refused(at: int, value: int, tmp_path: Path) -> None:
-    """Bytes 6 and 8 of a local file header are its flags (bit 0: encrypted) and its compression; in the central
-    directory, they are two bytes further on."""
-    np.savez(tmp_path / "dance.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
-    data = bytearray((tmp_path / "dance.npz").read_bytes())
-    for signature, place in ((b"PK\x03\x04", at), (b"PK\x01\x02", at + 2)):
-        data[data.index(signature) + place] = value
-    (tmp_path / "dance.npz").write_bytes(data)
-    with pytest.raises(InputError, match=r"not an \.npz of plain arrays"):
-        read_motion(tmp_path / "dance.npz")
 
 
 def test_a_pipe_in_place_of_a_motion_is_refused(tmp_path: Path) -> None:
