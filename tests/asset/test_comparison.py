@@ -141,33 +141,21 @@ def test_a_person_cut_to_a_narrow_strip_is_scored(
     assert min(found.photograph.shape[:2]) >= 11 and np.isfinite(found.scores["asset"]["ssim"])
 
 
-def test_test_cameras_with_masks_come_first(recorded: Capture, staged: StagedAvatar) -> None:
-    cameras = recorded.cameras | {"02": dataclasses.replace(side_camera(), name="02")}
-    tested = dataclasses.replace(recorded, cameras=cameras, test_cameras=("02",))
-    masks, avatar = masks_of(recorded.train_frames), GreyField(bending_body())
-    found = compare_with_field(tested, masks, avatar, staged)
-    assert [(c.view.camera, c.view.frame) for c in found] == [("01", frame) for frame in recorded.train_frames]
-    for frame in recorded.train_frames:
-        write_image(tested.root / f"images/02/{frame:06d}.png", np.full((480, 640, 3), 9, np.uint8))
-        write_image(tested.root / f"masks/02/{frame:06d}.png", np.where(square(), 255, 0).astype(np.uint8))
-    found = compare_with_field(tested, masks, avatar, staged)
-    assert [(c.view.camera, c.view.frame) for c in found] == [("02", frame) for frame in recorded.train_frames]
-    assert comparison_figures(found)["cameras"] == "test"
-    for frame in recorded.train_frames:  # whose masks say that the person is out of view
-        write_image(tested.root / f"masks/02/{frame:06d}.png", np.zeros((480, 640), np.uint8))
-    found = compare_with_field(tested, masks, avatar, staged)
-    assert [(c.view.camera, c.view.frame) for c in found] == [("01", frame) for frame in recorded.train_frames]
-
-
-def test_views_are_chosen_among_those_with_a_mask(recorded: Capture, staged: StagedAvatar) -> None:
-    """Only the last of three test cameras has masks."""
+@pytest.mark.parametrize(
+    ("masked", "chosen", "of"), [(None, "01", "training"), (255, "04", "test"), (0, "01", "training")]
+)
+def test_test_cameras_with_masks_of_the_person_come_first(
+    masked: int | None, chosen: str, of: str, recorded: Capture, staged: StagedAvatar
+) -> None:
+    """Of three test cameras only the last has masks, if any, and they may say that the person is out of view."""
     further = {name: dataclasses.replace(side_camera(), name=name) for name in ("02", "03", "04")}
     tested = dataclasses.replace(recorded, cameras=recorded.cameras | further, test_cameras=tuple(further))
-    for frame in recorded.train_frames:
+    for frame in recorded.train_frames if masked is not None else ():
         write_image(tested.root / f"images/04/{frame:06d}.png", np.full((480, 640, 3), 9, np.uint8))
-        write_image(tested.root / f"masks/04/{frame:06d}.png", np.where(square(), 255, 0).astype(np.uint8))
+        write_image(tested.root / f"masks/04/{frame:06d}.png", np.where(square(), masked, 0).astype(np.uint8))
     found = compare_with_field(tested, masks_of(recorded.train_frames), GreyField(bending_body()), staged)
-    assert [(c.view.camera, c.view.frame) for c in found] == [("04", frame) for frame in recorded.train_frames]
+    assert [(c.view.camera, c.view.frame) for c in found] == [(chosen, frame) for frame in recorded.train_frames]
+    assert comparison_figures(found)["cameras"] == of
 
 
 def test_without_any_mask_a_reason_is_given_and_the_export_passes(recorded: Capture, staged: StagedAvatar) -> None:
