@@ -8,10 +8,18 @@ from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import correctives_of
 from hnerf.asset.light import Light
 from hnerf.asset.package import write_package, write_usdz
-from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.staging import StagedAvatar, stage_avatar
 from hnerf.asset.texture import unwrap
-from tests.asset.figure import INFO, bending_body, posed_with_displacements, side_camera, upright_column, write_all
+from tests.asset.figure import (
+    FRAMES,
+    INFO,
+    bending_body,
+    dressed,
+    posed_with_displacements,
+    side_camera,
+    upright_column,
+    write_all,
+)
 
 
 @pytest.fixture(scope="session")
@@ -19,13 +27,11 @@ def staged() -> StagedAvatar:
     """Return a staged avatar: clothes around the bending column, with levels of 816 and 400 faces, two correctives of
     random noise, an expression that moves its top (`frown`), a physique (`stout`), textures and a normal map of noise,
     and light from above."""
-    body = bending_body()
     clothes = upright_column(0.18, -0.05, 1.65)
-    layout = unwrap(clothes.vertices, clothes.faces, 64)
-    clothed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    layout, clothed = unwrap(clothes.vertices, clothes.faces, 64), dressed(bending_body(), clothes)
     rng = np.random.default_rng(0)
     shapes_m = rng.normal(scale=0.01, size=(2, len(clothes.vertices), 3))
-    moved_m = np.einsum("nk,kvd->nvd", rng.normal(size=(len(body.frames), 2)), shapes_m).astype(np.float32)
+    moved_m = np.einsum("nk,kvd->nvd", rng.normal(size=(len(FRAMES), 2)), shapes_m).astype(np.float32)
     texture = rng.integers(0, 255, (64, 64, 3), np.uint8)
     surfaces_m = posed_with_displacements(clothed, moved_m)
     normals = rng.integers(100, 156, (32, 32, 3), np.uint8)

@@ -9,6 +9,7 @@ import torch
 import trimesh
 
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
+from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
@@ -37,8 +38,7 @@ def upright_column(radius_m: float, bottom_m: float, top_m: float, storeys: int 
 
 def twice(mesh: trimesh.Trimesh, apart_m: tuple[float, float, float]) -> trimesh.Trimesh:
     """Return one mesh that contains a mesh and a copy of it shifted by `apart_m`."""
-    vertices_m = np.concatenate([mesh.vertices, mesh.vertices + apart_m])
-    return trimesh.Trimesh(vertices_m, np.concatenate([mesh.faces, mesh.faces + len(mesh.vertices)]), process=False)
+    return trimesh.util.concatenate([mesh, mesh.copy().apply_translation(apart_m)])
 
 
 def upper_weight(z_m: torch.Tensor) -> torch.Tensor:
@@ -55,6 +55,11 @@ def bending_body() -> BodyFit:
         root[row, :2, :2] = torch.tensor([[c, -s], [s, c]])
         root[row, :3, 3] = torch.tensor([0.1 * frame, 2.0, 0.5])
     return BodyFit(column_rig(), FRAMES, theta, root)
+
+
+def dressed(body: BodyFit, clothes: trimesh.Trimesh) -> BodyFit:
+    """Return a fit whose surface is clothes around the body."""
+    return dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
 
 
 def posed_with_displacements(clothed: BodyFit, moved_m: np.ndarray) -> np.ndarray:

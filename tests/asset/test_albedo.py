@@ -1,13 +1,12 @@
 """Albedos of texels, worked out by hand, under light from above."""
 
 import numpy as np
-import torch
 
 from hnerf.asset.albedo import AlbedoBlend, mean_irradiance
 from hnerf.asset.light import Light
 from hnerf.asset.photographs import FIELD_WEIGHT, SeenTexels, TexelPixels
 from hnerf.asset.srgb import to_linear, to_srgb
-from hnerf.asset.texture import Texels
+from tests.asset.test_photographs import texels_at
 
 ABOVE = Light(np.array([0.6, 0, 0.4 * 3**0.5 / 2, 0, 0, 0, 0, 0, 0]), 0.0)  # E = 0.6 + 0.4 z
 UP, SIDE, DOWN = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.0, 0, -1])
@@ -48,8 +47,7 @@ def test_unseen_texels_keep_the_fields_colour_without_its_light() -> None:
 def test_irradiance_is_the_mean_over_surfaces() -> None:
     """A triangle that faces up in one frame and down in the other."""
     corners_m = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    place = torch.zeros(1, dtype=torch.long)
-    texels = Texels(place, place, place, torch.tensor([[0.2, 0.3, 0.5]]))
+    texels = texels_at([0], [[0.2, 0.3, 0.5]])
     found = mean_irradiance(ABOVE, [corners_m, corners_m * (1, -1, 1)], np.array([[0, 1, 2]]), texels)
     np.testing.assert_allclose(found, [(1 + 0.2) / 2], atol=1e-6)
 
@@ -58,7 +56,6 @@ def test_irradiance_uses_normalised_interpolated_normals() -> None:
     """The ridge of a roof has a normal half-way between up and +X. Half-way from the ridge to a corner that faces up,
     the normal is tilted by 22.5 degrees, where E = 0.6 + 0.4 cos."""
     corners_m = np.array([[-1.0, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1]])
-    place = torch.zeros(1, dtype=torch.long)
-    texels = Texels(place, place, place, torch.tensor([[0.5, 0.25, 0.25]]))
+    texels = texels_at([0], [[0.5, 0.25, 0.25]])
     found = mean_irradiance(ABOVE, [corners_m], np.array([[0, 1, 2], [1, 3, 2]]), texels)
     np.testing.assert_allclose(found, 0.6 + 0.4 * np.cos(np.pi / 8), atol=1e-6)

@@ -1,14 +1,11 @@
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.figures import beyond_skinning_mm
-from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.avatar.surface import step_to_surface
-from tests.asset.figure import bending_body, posed_with_displacements, upright_column
+from tests.asset.figure import bending_body, dressed, posed_with_displacements, upright_column
 from tests.asset.stand_in import StandInAvatar
 
 
@@ -21,7 +18,7 @@ def test_the_skinned_surface_is_moved_onto_the_fields_surface() -> None:
     """Clothes of radius 17 cm around a field of radius 16 cm: in every pose the sides move 1 cm inwards in rest
     coordinates, away from the joint."""
     body, clothes = bending_body(), upright_column(0.17, -0.02, 1.62)
-    clothed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    clothed = dressed(body, clothes)
     surfaces_m, moved_m = frame_surfaces(StandInAvatar(body), clothed)
     rest_m = clothes.vertices
     sides = (np.abs(rest_m[:, 2] - 0.8) > 0.35) & (rest_m[:, 2] > 0.1) & (rest_m[:, 2] < 1.5)
@@ -42,7 +39,7 @@ def test_surfaces_follow_displacements_along_the_surface() -> None:
             return moved_m
 
     body, clothes = bending_body(), upright_column(0.16, -0.02, 1.62)
-    clothed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    clothed = dressed(body, clothes)
     surfaces_m, moved_m = frame_surfaces(Sliding(body), clothed)
     height_m = clothes.vertices[:, 2]
     sides = (np.abs(height_m - 0.8) > 0.35) & (height_m > 0.1) & (height_m < 1.5)

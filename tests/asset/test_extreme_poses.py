@@ -22,6 +22,8 @@ from hnerf.asset.staging import StagedAvatar
 from hnerf.body.rig import Rig, joint_transforms
 from tests.asset.figure import column_rig, upright_column
 
+CLOTHED = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))  # as the fixture `staged`
+
 
 def joints_m(rig: Rig, theta: torch.Tensor | None) -> dict[str, np.ndarray]:
     assert theta is not None
@@ -38,24 +40,22 @@ def test_joint_turns_are_about_stage_axes_and_mirrored_to_the_other_side() -> No
 
 
 def test_a_bent_joint_moves_the_columns_top_to_the_front(staged: StagedAvatar) -> None:
-    rig = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))
-    upright = posed_m(staged, rig, torch.zeros(2, 3))
+    upright = posed_m(staged, CLOTHED, torch.zeros(2, 3))
     np.testing.assert_allclose(upright - upright[0], staged.rest_points_m - staged.rest_points_m[0], atol=1e-6)
-    bowed = posed_m(staged, rig, torch.tensor([[0.0, 0, 0], [math.pi / 2, 0, 0]]))
+    bowed = posed_m(staged, CLOTHED, torch.tensor([[0.0, 0, 0], [math.pi / 2, 0, 0]]))
     top = staged.rest_points_m[:, 1].argmax()  # 85 cm above the joint, which is at 0.85 m
     np.testing.assert_allclose(bowed[top] - upright[top], [0, -0.85, 0.85], atol=1e-4)
 
 
 def test_a_body_without_the_needed_joints_has_no_extreme_poses(staged: StagedAvatar) -> None:
     faceless = dataclasses.replace(staged, expressions_m={}, physiques_m={})
-    assert extreme_poses(faceless, clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65)), 0) == []
+    assert extreme_poses(faceless, CLOTHED, 0) == []
 
 
 def test_a_pose_that_would_frame_no_point_is_left_out(staged: StagedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
     """The clothes have no point that follows a head, as a captured mesh without hands has none that follows a hand."""
     monkeypatch.setattr("hnerf.asset.extreme_poses.TURNED_HEAD", {"root": (0, 20, 0)})
-    rig = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))
-    shown = extreme_poses(dataclasses.replace(staged, expressions_m={}), rig, len(staged.faces))
+    shown = extreme_poses(dataclasses.replace(staged, expressions_m={}), CLOTHED, len(staged.faces))
     assert [pose.name for pose in shown] == ["Stout"]
 
 
@@ -74,8 +74,7 @@ def test_an_expression_is_the_sum_of_its_units(staged: StagedAvatar) -> None:
 
 def test_expressions_and_physiques_are_shown_with_the_poses(staged: StagedAvatar) -> None:
     units = {name: np.full((len(staged.rest_points_m), 3), 0.01) for parts in EXPRESSIONS.values() for name in parts}
-    rig = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))
-    shown = extreme_poses(dataclasses.replace(staged, expressions_m=units), rig, len(staged.faces))
+    shown = extreme_poses(dataclasses.replace(staged, expressions_m=units), CLOTHED, len(staged.faces))
     assert [pose.name for pose in shown] == [*EXPRESSIONS, "Stout"]
     np.testing.assert_array_equal(shown[-1].points_m, staged.rest_points_m + staged.physiques_m["stout"])
     assert shown[-1].shown.all()

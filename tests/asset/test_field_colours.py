@@ -1,16 +1,27 @@
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from hnerf.asset.field_colours import field_colours, filled, median_of_seen
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.texture import Texels, rasterise, texture_image, unwrap
 from hnerf.body.fit_result import BodyFit
-from tests.asset.figure import bending_body, column_rig, no_cavities, twice, upright_column
+from tests.asset.figure import bending_body, column_rig, dressed, no_cavities, twice, upright_column
 from tests.asset.stand_in import StandInAvatar, rest_colour
+
+UPRIGHT = BodyFit(column_rig(), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
+
+
+def texels_of(clothes: trimesh.Trimesh) -> Texels:
+    """Return the texels of a texture of 64 px."""
+    return rasterise(unwrap(clothes.vertices, clothes.faces, 64), 64)
+
+
+def middles_of(count: int) -> Texels:
+    """Return a texel in the middle of each of the first faces."""
+    return Texels(*torch.zeros(2, count).long(), torch.arange(count), torch.full((count, 3), 1 / 3))
 
 
 def test_colours_are_read_on_the_fields_own_surface() -> None:
@@ -23,9 +34,8 @@ def test_colours_are_read_on_the_fields_own_surface() -> None:
 
     body = bending_body()
     clothes = upright_column(0.175, 0.2, 1.4)  # its sides are 1.5 cm outside the field's surface, its caps far inside
-    layout = unwrap(clothes.vertices, clothes.faces, 64)
-    posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
-    field_colours(Recording(body), posed, rasterise(layout, 64), no_cavities(posed))
+    posed = dressed(body, clothes)
+    field_colours(Recording(body), posed, texels_of(clothes), no_cavities(posed))
     assert len(read_m) == len(body.frames)
     for distance_m in read_m:
         assert distance_m.abs().median() < 0.002
@@ -35,9 +45,7 @@ def test_baked_colours_match_the_point_on_the_rest_body() -> None:
     body = bending_body()
     clothes = upright_column(0.16, 0.0, 1.6)
     layout = unwrap(clothes.vertices, clothes.faces, 256)
-    rig = clothed_rig(body.rig, clothes)
-    texels = rasterise(layout, 256)
-    posed = dataclasses.replace(body, rig=rig)
+    texels, posed = rasterise(layout, 256), dressed(body, clothes)
     colours = field_colours(StandInAvatar(body), posed, texels, no_cavities(posed))
     image = texture_image(texels, colours, 256)
     middle_uv = layout.uvs[layout.face_uvs].mean(1)
@@ -60,11 +68,9 @@ def test_texels_off_the_fields_surface_take_the_surrounding_colour() -> None:
         def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
             return points_m[:, 2:].expand(-1, 3) / 2
 
-    body = BodyFit(column_rig(), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
     clothes = upright_column(0.16, 0.0, 1.85)
-    texels = rasterise(unwrap(clothes.vertices, clothes.faces, 64), 64)
-    posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
-    colours = field_colours(Height(body), posed, texels, no_cavities(posed))
+    texels, posed = texels_of(clothes), dressed(UPRIGHT, clothes)
+    colours = field_colours(Height(UPRIGHT), posed, texels, no_cavities(posed))
     z_m = clothes.triangles_center[texels.face.numpy(), 2]
     assert colours[z_m > 1.7].max() < 0.83
     assert colours[z_m > 1.7].min() > 0.7
@@ -77,13 +83,11 @@ def test_cavities_take_the_surrounding_colour() -> None:
         def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
             return torch.where(points_m[:, 2:] < 0.85, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]))
 
-    body = BodyFit(column_rig(), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
     clothes = upright_column(0.16, 0.0, 1.6)
-    texels = rasterise(unwrap(clothes.vertices, clothes.faces, 64), 64)
-    posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    texels, posed = texels_of(clothes), dressed(UPRIGHT, clothes)
     z_m = clothes.triangles_center[texels.face.numpy(), 2]
     for cavities, above in ((no_cavities(posed), [0, 1, 0]), (clothes.vertices[:, 2] > 0.75, [1, 0, 0])):
-        colours = field_colours(Halves(body), posed, texels, cavities)
+        colours = field_colours(Halves(UPRIGHT), posed, texels, cavities)
         np.testing.assert_allclose(np.median(colours[z_m > 0.9], 0), above, atol=1e-3)
         np.testing.assert_allclose(np.median(colours[z_m < 0.7], 0), [1, 0, 0], atol=1e-3)
 
@@ -98,9 +102,7 @@ def test_unknown_colours_are_interpolated_over_the_mesh() -> None:
     """The column is black below 0.4 m and white above 1.2 m. In between, the harmonic function of a column is linear in
     height."""
     column = upright_column(0.15, 0.0, 1.6)
-    rig = clothed_rig(bending_body().rig, column)
-    faces = np.arange(len(column.faces))
-    texels = Texels(*torch.zeros(2, len(faces)).long(), torch.from_numpy(faces), torch.full((len(faces), 3), 1 / 3))
+    rig, texels = clothed_rig(column_rig(), column), middles_of(len(column.faces))
     z_m = column.triangles_center[:, 2]
     colours = np.select([z_m < 0.4, z_m > 1.2], [0.0, 1.0], np.nan)[:, None] * np.ones(3)
     result = filled(colours, texels, rig)
@@ -112,9 +114,8 @@ def test_unknown_colours_are_interpolated_over_the_mesh() -> None:
 
 def test_a_component_without_any_colour_takes_the_mean() -> None:
     near = upright_column(0.15, 0.0, 1.6)
-    rig = clothed_rig(bending_body().rig, twice(near, (1.0, 0, 0)))
-    faces = torch.arange(len(rig.faces))
-    texels = Texels(*torch.zeros(2, len(faces)).long(), faces, torch.full((len(faces), 3), 1 / 3))
-    colours = np.full((len(faces), 3), np.nan)
+    rig = clothed_rig(column_rig(), twice(near, (1.0, 0, 0)))
+    colours = np.full((len(rig.faces), 3), np.nan)
     colours[: len(near.faces)] = (0.2, 0.4, 0.6)
-    np.testing.assert_allclose(filled(colours, texels, rig), [[0.2, 0.4, 0.6]] * len(faces), atol=1e-6)
+    result = filled(colours, middles_of(len(colours)), rig)
+    np.testing.assert_allclose(result, [[0.2, 0.4, 0.6]] * len(colours), atol=1e-6)

@@ -2,11 +2,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from hnerf.asset.plate import Plate
 from hnerf.asset.registration import _loosened, _match, crossing_faces, register
+from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.body.base_mesh import BaseMesh, base_mesh
 from hnerf.geometry.mesh_queries import Surface
 from tests.asset.figure import column_rig, twice, upright_column
@@ -14,12 +14,7 @@ from tests.asset.figure import column_rig, twice, upright_column
 
 def bare(mesh: trimesh.Trimesh) -> BaseMesh:
     """Return a mesh as a body's base mesh in which every face is skin."""
-    rig = dataclasses.replace(
-        column_rig(),
-        vertices_m=torch.from_numpy(np.asarray(mesh.vertices)).float(),
-        faces=torch.from_numpy(np.asarray(mesh.faces)).long(),
-    )
-    return base_mesh(rig)
+    return base_mesh(clothed_rig(column_rig(), mesh))
 
 
 def test_registration_moves_a_column_onto_the_surface_around_it() -> None:

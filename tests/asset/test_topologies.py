@@ -6,6 +6,7 @@ import trimesh
 
 from hnerf.asset.correctives import as_they_are
 from hnerf.asset.registration import crossing_faces
+from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.topologies import AssetMesh, registered_mesh
 from tests.asset.figure import column_rig, twice, upper_weight, upright_column
 
@@ -14,12 +15,7 @@ def test_a_moved_mesh_does_not_cross_itself() -> None:
     """Of two boxes 3 mm apart, one should move by 3.5 mm towards the other. Its vertices that would cross move only
     half as far."""
     boxes = twice(trimesh.creation.box(extents=(0.02, 0.02, 0.02)), (0.023, 0.001, 0.001))
-    rig = dataclasses.replace(
-        column_rig(),
-        vertices_m=torch.from_numpy(np.asarray(boxes.vertices)).float(),
-        faces=torch.from_numpy(np.asarray(boxes.faces)).long(),
-    )
-    mesh = AssetMesh(rig, as_they_are, len(rig.faces), None)
+    mesh = AssetMesh(clothed_rig(column_rig(), boxes), as_they_are, len(boxes.faces), None)
     offsets_m = np.zeros((16, 3), np.float32)
     offsets_m[8:, 0] = -0.0035
     moved = mesh.moved(offsets_m).trimesh
