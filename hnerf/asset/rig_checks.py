@@ -51,9 +51,8 @@ def _eyes_off(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, skele
     """Return the names of the eyes whose joints are off the centre of the points (V, 3) that follow them. joints,
     weights (V, K)."""
     off = []
-    for j, (token, bind) in enumerate(
-        zip(skeleton.GetJointsAttr().Get(), skeleton.GetBindTransformsAttr().Get(), strict=True)
-    ):
+    tokens, binds = skeleton.GetJointsAttr().Get(), skeleton.GetBindTransformsAttr().Get()
+    for j, (token, bind) in enumerate(zip(tokens, binds, strict=False)):  # `skeleton_defects` compares their numbers
         name = token.rpartition("/")[2]
         if name.startswith("eye_") and len(ball := points[((joints == j) & (weights > 0)).any(1)]):
             low, high = box(ball)

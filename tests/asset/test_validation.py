@@ -59,9 +59,12 @@ def giant(stage: Usd.Stage) -> None:
     points(stage).Set(Vt.Vec3fArray.FromNumpy(np.array(points(stage).Get()) * 100))
 
 
-def uvs_missing(stage: Usd.Stage) -> None:
-    st = UsdGeom.PrimvarsAPI(mesh(stage)).GetPrimvar("st")
-    st.SetIndices(Vt.IntArray(list(st.GetIndices())[:-1]))
+def uvs(stage: Usd.Stage) -> UsdGeom.Primvar:
+    return UsdGeom.PrimvarsAPI(mesh(stage)).GetPrimvar("st")
+
+
+def shorten(attribute: Usd.Attribute) -> None:
+    attribute.Set(attribute.Get()[:-1])
 
 
 def floating(stage: Usd.Stage) -> None:
@@ -72,11 +75,6 @@ def floating(stage: Usd.Stage) -> None:
 
 def one_eye(stage: Usd.Stage) -> None:
     joints(stage, "root", "root/pelvis", "root/pelvis/eye_L")
-
-
-def short_expression(stage: Usd.Stage) -> None:
-    offsets = shape(stage, "frown").GetOffsetsAttr()
-    offsets.Set(offsets.Get()[:-1])
 
 
 def small_hint(stage: Usd.Stage) -> None:
@@ -91,16 +89,28 @@ DAMAGE = {
     "face index out of range": lambda s: change(mesh(s).GetFaceVertexIndicesAttr(), 0, len(points(s).Get())),
     "not a person's size": giant,
     "extent does not contain the points": lambda s: mesh(s).GetExtentAttr().Set([Gf.Vec3f(0), Gf.Vec3f(0)]),
-    "outside [0, 1]": lambda s: change(UsdGeom.PrimvarsAPI(mesh(s)).GetPrimvar("st").GetAttr(), 0, Gf.Vec2f(1.5, 0)),
-    "texture coordinates for": uvs_missing,
+    "face corners but": lambda s: shorten(mesh(s).GetFaceVertexIndicesAttr()),
+    "has no mesh and no splats": lambda s: mesh(s).GetPrim().SetActive(False),
+    "outside [0, 1]": lambda s: change(uvs(s).GetAttr(), 0, Gf.Vec2f(1.5, 0)),
+    "texture coordinates for": lambda s: shorten(uvs(s).GetIndicesAttr()),
+    "texture coordinate index out of range": lambda s: change(uvs(s).GetIndicesAttr(), 0, 10**6),
+    "no face-varying texture coordinates": lambda s: uvs(s).SetInterpolation(UsdGeom.Tokens.vertex),
+    "bound to no skeleton": lambda s: UsdSkel.BindingAPI(mesh(s)).CreateSkeletonRel().SetTargets([]),
+    "joint indices and": lambda s: shorten(UsdSkel.BindingAPI(mesh(s)).GetJointWeightsAttr()),
+    "joint names are not unique": lambda s: joints(s, "root", "root/pelvis", "root/pelvis"),
     "joint names are not identifiers": lambda s: joints(s, "root", "root/pelvis", "root/pelvis/upper.L"),
     "quaternions are not finite or not of unit length": lambda s: turned(s, *[Gf.Quatf(2, 0, 0, 0)] * 3),
     "does not have one transform per joint": lambda s: turned(s, *[Gf.Quatf(1, 0, 0, 0)] * 2),
+    "restTransforms is not finite or does": lambda s: shorten(skeleton(s).GetRestTransformsAttr()),
+    "bindTransforms is not finite or does": lambda s: shorten(skeleton(s).GetBindTransformsAttr()),
     "bindTransforms are no rotations": lambda s: change(skeleton(s).GetBindTransformsAttr(), 2, Gf.Matrix4d(2)),
     "restTransforms do not compose to bindTransforms": lambda s: change(
         skeleton(s).GetRestTransformsAttr(), 2, Gf.Matrix4d(1)
     ),
     "no root on the ground with a pelvis below it": lambda s: joints(s, "hips", "hips/spine", "hips/spine/upper_L"),
+    "root does not stand below pelvis at rest": lambda s: change(
+        skeleton(s).GetBindTransformsAttr(), 1, Gf.Matrix4d().SetTranslate(Gf.Vec3d(0.1, 0, 0))
+    ),
     "does not name its rest pose": lambda s: skeleton(s).GetPrim().SetCustomDataByKey("restPose", ""),
     "its lowest point at rest is at height 0.3 m": floating,
     "skin follows one eye and not the other": one_eye,
@@ -112,7 +122,7 @@ DAMAGE = {
     "frown: point index out of range": lambda s: change(
         shape(s, "frown").GetPointIndicesAttr(), 0, len(points(s).Get())
     ),
-    "frown: offsets are not finite or not one a point": short_expression,
+    "frown: offsets are not finite or not one a point": lambda s: shorten(shape(s, "frown").GetOffsetsAttr()),
     "blend shape weights are not one a shape from 0 to 1 at time 5": lambda s: change(
         motion(s).GetBlendShapeWeightsAttr(), 0, -0.5, 5.0
     ),
@@ -124,6 +134,7 @@ DAMAGE = {
 }
 OF_ROOT_LAYER = {  # likewise, for metadata that only the root layer has
     "metersPerUnit is 0.01": lambda s: UsdGeom.SetStageMetersPerUnit(s, 0.01),
+    "up axis is Z": lambda s: UsdGeom.SetStageUpAxis(s, UsdGeom.Tokens.z),
     "assetInfo has no identifier": lambda s: s.GetDefaultPrim().ClearAssetInfoByKey("identifier"),
     "timeCodesPerSecond and framesPerSecond differ": lambda s: s.SetFramesPerSecond(24),
     "ends before it starts": lambda s: s.SetEndTimeCode(-1),
