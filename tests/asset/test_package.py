@@ -137,16 +137,6 @@ def test_full_detail_is_the_default(name: str, package: Path, staged: StagedAvat
         np.testing.assert_allclose(mesh.GetDisplayColorAttr().Get(), colours, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
-def test_the_captured_frames_are_the_time_codes(name: str, package: Path, staged: StagedAvatar) -> None:
-    stage = Usd.Stage.Open(str(package / name))
-    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (10, 3, 8)
-    motion = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Motion/full"))
-    assert motion.GetRotationsAttr().GetTimeSamples() == list(FRAMES)
-    for frame, expected in zip(FRAMES, staged.points_m, strict=True):
-        np.testing.assert_allclose(skinned_points(stage, frame), expected, atol=1e-5)
-
-
 @pytest.mark.parametrize("lod", ["lod0", "lod1"])
 def test_expressions_are_sparse_blend_shapes_that_no_motion_uses(lod: str, package: Path, staged: StagedAvatar) -> None:
     stage = Usd.Stage.Open(str(package / "avatar.usda"))
@@ -192,16 +182,23 @@ def test_a_level_that_lacks_an_expressions_points_still_has_the_expression(
     assert list(wink.GetOffsetsAttr().Get()) == [(0, 0, 0)]
 
 
-@pytest.mark.parametrize("rate", [24, 30])
-def test_an_interface_at_another_rate_has_whole_time_codes(rate: int, package: Path, staged: StagedAvatar) -> None:
-    stage = Usd.Stage.Open(str(package / f"avatar_{rate}.usda"))
-    codes = staged.rigs["full"].motions[f"captured_{rate}"].codes
+@pytest.mark.parametrize(
+    ("name", "motion", "rate"),
+    [
+        ("avatar.usda", "captured", 10),
+        ("avatar.usdz", "captured", 10),
+        ("avatar_24.usda", "captured_24", 24),
+        ("avatar_30.usda", "captured_30", 30),
+    ],
+)
+def test_frames_are_whole_time_codes(name: str, motion: str, rate: int, package: Path, staged: StagedAvatar) -> None:
+    stage, codes = Usd.Stage.Open(str(package / name)), staged.rigs["full"].motions[motion].codes.tolist()
     assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (
         rate, codes[0], codes[-1],
     )  # fmt: skip
-    motion = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Motion/full"))
-    assert motion.GetRotationsAttr().GetTimeSamples() == codes.tolist()
-    # 0.5 s, the capture's frame 5, is a whole time code at either rate.
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Motion/full"))
+    assert animation.GetRotationsAttr().GetTimeSamples() == codes
+    # 0.5 s, the capture's frame 5, is a whole time code at each rate.
     np.testing.assert_allclose(skinned_points(stage, rate / 2), staged.points_m[2], atol=1e-5)
 
 
