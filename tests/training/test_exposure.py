@@ -13,11 +13,9 @@ import trimesh
 from hnerf.avatar.trained import TrainedAvatar, build_field
 from hnerf.capture.masks import Masks, encode
 from hnerf.geometry.mesh_queries import Surface
-from hnerf.geometry.reach import everywhere
 from hnerf.training import exposure
 from hnerf.training.exposure import _vertex_colours, _visible_vertices, camera_gains, solve_gains
-from hnerf.training.gather import gather_pixels
-from tests.training.scene import ALONE, TINY, look_at, record
+from tests.training.scene import TINY, look_at, record
 
 BALL = trimesh.creation.icosphere(subdivisions=5)  # 10242 vertices 1 m around the origin
 RING = {name: look_at(name, 4.0 * np.array([x, y, 0]), np.zeros(3)).resized(128, 128)
@@ -132,17 +130,6 @@ def test_hidden_and_grazing_vertices_are_not_visible() -> None:
     turned = np.diag([-1.0, 1, -1])
     away = dataclasses.replace(RING["a"], R=turned @ RING["a"].R, t_m=turned @ RING["a"].t_m)
     assert not _visible_vertices(away, Surface(BALL))[0].any()  # the ball is behind the camera
-
-
-def test_pixels_are_corrected_by_the_gains_of_their_cameras(tmp_path: Path) -> None:
-    scene = record(tmp_path)
-    gains = {"0": (2.0, 1.0, 0.5)} | dict.fromkeys(scene[0].train_cameras[1:], (1.0, 1.0, 1.0))
-    pixels, exposure_corrected = (gather_pixels(*scene, everywhere, by, tmp_path, ALONE) for by in ({}, gains))
-    first = pixels.cameras_and_xy(torch.arange(len(pixels.person)))[0] == 0
-    assert exposure_corrected.colour[first & pixels.person].unique(dim=0).tolist() == [[100, 50, 100]]  # of 200, 50, 50
-    assert pixels.plate is not None and exposure_corrected.plate is not None
-    assert exposure_corrected.plate[first].unique(dim=0).tolist() == [[64, 128, 255]]  # of 128
-    assert torch.equal(exposure_corrected.colour[~first], pixels.colour[~first])
 
 
 def test_rendering_a_training_camera_applies_its_gain(tmp_path: Path) -> None:

@@ -358,25 +358,6 @@ def test_a_full_disk_is_an_os_error_and_leaves_no_partial_checkpoint(tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_parallel_halves_have_the_gradients_of_the_whole_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """On a CPU with two threads, gradients are the same bit by bit each time, whichever half ends first, and equal
-    those of one batch except for the order of sums."""
-    gradients = []
-    for threads in (1, 2, 2):
-        monkeypatch.setattr(torch, "get_num_threads", lambda n=threads: n)
-        t = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
-        assert t.parts.count == threads
-        t.optimizer.step = lambda: None
-        terms = t._optimise(t.objective)
-        found = {name: q.grad for name, q in t.objective.named_parameters() if q.grad is not None}
-        gradients.append(found | {name: term.detach() for name, term in terms.items()})
-    whole, halves, again = gradients
-    assert whole.keys() == halves.keys() and any("correction" in name for name in whole)
-    for name, gradient in whole.items():
-        torch.testing.assert_close(halves[name], gradient, atol=1e-6, rtol=1e-4)
-        torch.testing.assert_close(halves[name], again[name], atol=0, rtol=0)
-
-
 def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path):
     """The published method draws uniformly from all pixels; a composited field needs pixels near the person."""
     scene = record(tmp_path)

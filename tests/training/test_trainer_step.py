@@ -111,13 +111,14 @@ def test_rates_rise_for_20_steps_and_fall_to_a_tenth(tmp_path: Path) -> None:
 
 
 def test_exposure_is_corrected_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Camera 2 shows red twice as bright as the others. The person is (200, 50, 50) in front of a plate of 128."""
-    gains = dict.fromkeys("0123", (1.0, 1.0, 1.0)) | {"2": (2.0, 1.0, 1.0)}
+    """Camera 2 shows red twice as bright as the others, and blue half as bright. The person is (200, 50, 50) in front
+    of a plate of 128."""
+    gains = dict.fromkeys("0123", (1.0, 1.0, 1.0)) | {"2": (2.0, 1.0, 0.5)}
     monkeypatch.setattr(trainer_module, "camera_gains", lambda *inputs: (gains, Decision(2.0, "twice as bright")))
     handed = step_inputs(trainer_of(tmp_path, rays_per_frame=512))
     colour, plate, person, edge = (handed.all(0, name) for name in ("colour", "plate", "person", "edge"))
     bright = handed.all(0, "origins_m")[:, 0] < -3  # camera 2 stands at x = -3.5 m
-    for camera, red, grey in ((bright, [100, 50, 50], [64, 128, 128]), (~bright, [200, 50, 50], [128, 128, 128])):
+    for camera, red, grey in ((bright, [100, 50, 100], [64, 128, 255]), (~bright, [200, 50, 50], [128, 128, 128])):
         assert (255 * colour[camera & person]).round().unique(dim=0).tolist() == [red]
         assert (255 * plate[camera & ~edge]).round().unique(dim=0).tolist() == [grey]
 
