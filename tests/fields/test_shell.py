@@ -57,15 +57,6 @@ def test_cell_states_around_a_sphere():
     assert along_x(grid, [0.0, 0.27, 0.33, 0.42, 5.0]) == [SOLID, SHELL, SHELL, EMPTY, EMPTY]
 
 
-def test_the_shell_has_the_thickness_of_each_surface_point():
-    """The shell is thick for x > 0 and thin on the other side, so a point 8 cm from the surface is in the shell on one
-    side only."""
-    surface = sphere(0.3)
-    outer = torch.where(surface[..., 0] > 0, 0.1, 0.02)
-    grid = shell_around(surface, outer, torch.full_like(outer, 0.02), 0.01)
-    assert along_x(grid, [0.38, -0.38, 0.31, -0.31]) == [SHELL, EMPTY, SHELL, SHELL]
-
-
 def test_shell_cells_are_those_within_reach_of_any_surface_point():
     """Every cell is compared with each of 60 points of different thickness."""
     random = torch.Generator().manual_seed(0)

@@ -40,8 +40,7 @@ def test_interpolation_and_gradients_match_plain_grids() -> None:
             grids.features.data = grids.features.grad
             levels = grids.dense_levels()
         found.append([features.detach(), points.grad[:-4], *levels])
-    for mine, plain in zip(*found, strict=True):
-        torch.testing.assert_close(mine, plain, atol=2e-5, rtol=1e-4)
+    torch.testing.assert_close(*found, atol=2e-5, rtol=1e-4)
 
 
 def test_all_nodes_near_samples_are_kept() -> None:
