@@ -1,0 +1,40 @@
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.asset import report
+from hnerf.asset.albedo import Albedo
+from hnerf.asset.comparison import Compared
+from hnerf.asset.staging import StagedAvatar
+from hnerf.evaluation.views import View
+
+
+def grey(level: int, channels: int) -> np.ndarray:
+    return np.full((64, 64, channels), level, np.uint8)
+
+
+def test_every_picture_has_its_caption(staged: StagedAvatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Textures and renders are each of one grey level; the addresses of pictures are those of their first pixels."""
+    monkeypatch.setattr(report, "TURNS", 2)
+    monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))
+    monkeypatch.setattr(report, "data_uri", lambda picture: str(picture[0, 0, 0]))
+    assert staged.albedo is not None
+    avatar = dataclasses.replace(staged, texture=grey(50, 3), albedo=Albedo(grey(60, 3), staged.albedo.light))
+    levels = {"field": 10, "asset": 20, "albedo": 30, "splats": 40}
+    renders = {name: grey(level, 4) for name, level in levels.items()}
+    scores = {name: {"psnr": float(level)} for name, level in levels.items()}
+    compared = Compared(View("novel_view", "01", 4), grey(5, 3), renders, scores)
+    report.write_report(tmp_path / "report.html", "ada", avatar, 3, np.eye(4), [compared], [], {"viewer": "none"})
+    page = (tmp_path / "report.html").read_text()
+    shown = {caption: int(level) for level, caption in re.findall(r'<img src="(\d+)" alt="([^"]*)"', page)}
+    light = "Estimated light, +Z in the middle, +X left of it"
+    turntable, surface = ["0°", "180°"], ["Clay, front", "Clay, back", "Wireframe, front", "Wireframe, back"]
+    assert list(shown)[:7] == [*turntable, *surface, "lod1, 400 triangles"]
+    assert {caption: level for caption, level in list(shown.items())[7:] if caption not in ("Layout", light)} == {
+        "Photograph, camera 01, frame 4": 5, "Field, 10.0 dB": 10, "Captured look, 20.0 dB": 20,
+        "Albedo in its light, 30.0 dB": 30, "Splats, 40.0 dB": 40, "Texture": 50, "Albedo": 60,
+    }  # fmt: skip
+    assert {"Layout", light} <= shown.keys()
