@@ -45,11 +45,25 @@ def test_settings_equal_values_computed_by_hand():
     assert decisions["field.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
 
 
-def test_cells_are_no_finer_than_the_alignment_of_frames():
-    """Pixels of 1 mm would give 1920 cells, but frames align only to 1 cm."""
-    fast = decided(replace(SCENE, footprint_m=0.001))[0].field
-    assert fast.colour_cells[-1] == 192
-    assert fast.geometry_cells[-1] == 128
+@pytest.mark.parametrize(
+    ("changed", "given", "expected"),
+    [
+        # Pixels of 1 mm would give 1920 cells, but frames align only to 1 cm.
+        ({"footprint_m": 0.001}, {}, {"colour_cells": (24, 48, 96, 192), "geometry_cells": (16, 45, 128)}),
+        # Pixels of 10 cm give 19 cells, and 13 for geometry: fewer than the coarsest levels, 24 and 16.
+        ({"footprint_m": 0.1}, {}, {"colour_cells": (19,), "geometry_cells": (13,)}),
+        # 128 / 1.5 = 85, whatever the pixel size.
+        ({}, {"colour_cells": [24, 128]}, {"geometry_cells": (16, 37, 85)}),
+        # 2.4 x (20 + 5) cm / 6 mm = 100.
+        ({}, {"outer_m": 0.2, "inner_m": 0.05}, {"samples": 100}),
+        # A skirt reaches 30 cm out from the body, the shell at most 15: 2.4 x (15 + 3) cm / 6 mm = 72.
+        ({"outside_m": 0.3}, {}, {"outer_m": 0.15, "inner_m": 0.03, "samples": 72}),
+    ],
+    ids=["small pixels", "large pixels", "given cells", "given shell", "skirt"],
+)
+def test_cells_shell_and_samples_by_hand(changed: dict, given: dict, expected: dict):
+    fast = decided(replace(SCENE, **changed), field={"kind": "fast"} | given)[0].field
+    assert {name: getattr(fast, name) for name in expected} == expected
 
 
 @pytest.mark.parametrize("nearly_static", [{"frames": 1}, {"std_rad": 0.001}])
@@ -62,33 +76,11 @@ def test_with_one_posture_cells_are_as_fine_as_pixels(nearly_static: dict):
         assert "there is one posture: cells of 8.0 mm" in decisions["field.colour_cells"].reason
 
 
-def test_geometry_cells_follow_from_given_colour_cells():
-    """128 / 1.5 = 85, whatever the pixel size."""
-    assert decided(SCENE, field={"kind": "fast", "colour_cells": [24, 128]})[0].field.geometry_cells[-1] == 85
-
-
 def test_given_settings_are_kept():
     settings, decisions = decided(SCENE, steps=7, field={"kind": "fast", "samples": 5, "outer_m": 0.2})
     assert (settings.steps, settings.field.samples, settings.field.outer_m) == (7, 5, 0.2)
     open_ones = ("inner_m", "colour_cells", "geometry_cells", "pose_width", "nodes")
     assert set(decisions) == {*(f"field.{name}" for name in open_ones), "one_posture", "ground"}
-
-
-def test_samples_follow_from_a_given_shell():
-    """2.4 x (20 + 5) cm / 6 mm = 100."""
-    assert decided(SCENE, field={"kind": "fast", "outer_m": 0.2, "inner_m": 0.05})[0].field.samples == 100
-
-
-def test_a_shell_is_at_most_fifteen_centimetres_thick():
-    """A skirt reaches 30 cm out from the body: 2.4 x (15 + 3) cm / 6 mm = 72."""
-    fast = decided(replace(SCENE, outside_m=0.3))[0].field
-    assert (fast.outer_m, fast.inner_m, fast.samples) == (0.15, 0.03, 72)
-
-
-def test_a_person_far_away_has_one_level():
-    """Pixels of 10 cm give 19 cells on 1.92 m, and 13 for geometry: fewer than the coarsest levels, 24 and 16."""
-    fast = decided(replace(SCENE, footprint_m=0.1))[0].field
-    assert (fast.colour_cells, fast.geometry_cells) == ((19,), (13,))
 
 
 @pytest.mark.parametrize(
