@@ -122,36 +122,29 @@ def test_a_method_holds_up_to_the_strength_at_which_all_seeds_are_ok() -> None:
     assert tolerated_strength(RESULT, "nerf", "mask_holes") == "refused at 5"
 
 
-def test_a_method_does_not_hold_at_a_degraded_strength_even_if_a_stronger_one_is_ok() -> None:
-    words = {1: "degraded", 2: "ok", 5: "failed"}
-    rows = [run("fast", "pose_noise", s, 0, word, 30.0) for s, word in words.items()]
-    result = RESULT | {"runs": [run("fast", "as recorded", None, 0, "ok", 30.0), *rows]}
-    assert tolerated_strength(result, "fast", "pose_noise") == "degraded at 1, failed at 5"
-    rows[0] = run("fast", "pose_noise", 1, 0, "ok", 30.0)
-    rows[1] = run("fast", "pose_noise", 2, 0, "degraded", 28.0)
-    assert tolerated_strength(result | {"runs": rows}, "fast", "pose_noise") == "holds to 1, degraded at 2, failed at 5"
+def noisy(strength: float, verdict: str) -> dict[str, Any]:
+    return run("fast", "pose_noise", strength, 0, verdict, 30.0)
 
 
-def test_a_seed_whose_reference_run_failed_is_ignored() -> None:
-    """Seed 1 fails on the capture as recorded, while seed 0 holds."""
-    rows = [run("fast", "as recorded", None, 0, "ok", 30.0), run("fast", "as recorded", None, 1, "failed", None)]
-    result = RESULT | {"runs": [*rows, run("fast", "pose_noise", 1, 0, "ok", 30.0)]}
-    assert tolerated_strength(result, "fast", "pose_noise") == "holds to 1"
-    assert tolerated_strength(result, "fast", "mask_holes") == "-"
+GOOD, UNSCORED = (run("fast", "as recorded", None, 0, verdict, 30.0) for verdict in ("ok", "unscored"))
 
 
-def test_unscored_runs_do_not_count_as_holding() -> None:
-    good = run("fast", "as recorded", None, 0, "unscored", None)
-    unknown = RESULT | {"runs": [good, run("fast", "pose_noise", 1, 0, "unscored", None)]}
-    assert tolerated_strength(unknown, "fast", "pose_noise") == "unscored"
-    partly = RESULT | {"runs": [*RESULT["runs"][:4], run("fast", "pose_noise", 2, 0, "unscored", None)]}  # type: ignore[index]
-    assert tolerated_strength(partly, "fast", "pose_noise") == "holds to 1"
-
-
-def test_all_strengths_count_as_failed_if_the_reference_run_failed() -> None:
-    """The run has scores, too: its images are no better than empty ones."""
-    failed = run("fast", "as recorded", None, 0, "ok", 10.0) | {"verdict": "failed"}
-    assert tolerated_strength(RESULT | {"runs": [failed]}, "fast", "pose_noise") == "failed at 1"
+@pytest.mark.parametrize(
+    ("runs", "expected"),
+    [
+        ([GOOD, noisy(1, "degraded"), noisy(2, "ok"), noisy(5, "failed")], "degraded at 1, failed at 5"),
+        ([GOOD, noisy(1, "ok"), noisy(2, "degraded"), noisy(5, "failed")], "holds to 1, degraded at 2, failed at 5"),
+        ([GOOD, run("fast", "as recorded", None, 1, "failed", None), noisy(1, "ok")], "holds to 1"),
+        ([GOOD], "-"),
+        ([UNSCORED, noisy(1, "unscored")], "unscored"),
+        ([GOOD, noisy(1, "ok"), noisy(2, "unscored")], "holds to 1"),
+        ([GOOD | {"verdict": "failed"}], "failed at 1"),
+    ],
+    ids=["degraded, then ok", "degraded, then failed", "a seed without reference", "never run", "unscored",
+         "unscored, then", "no reference, though with scores"],
+)  # fmt: skip
+def test_the_strength_to_which_a_method_holds(runs: list[dict[str, Any]], expected: str) -> None:
+    assert tolerated_strength(RESULT | {"runs": runs}, "fast", "pose_noise") == expected
 
 
 def test_the_tables_by_hand() -> None:
