@@ -18,7 +18,7 @@ from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks, encode
 from hnerf.evaluation import geometry
 from hnerf.evaluation.inputs import EvaluationInputs
-from hnerf.geometry.camera import Camera
+from hnerf.geometry.camera import Camera, look_at
 from tests.body.boxes import hinged
 
 RADIUS_M = 0.1
@@ -72,12 +72,9 @@ def ball_mask(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
 
 def ball_camera(name: str, turn_deg: float) -> Camera:
     """Return a camera 0.75 m away, at the ball's height, that looks at (0, 0, 1)."""
-    angle = np.deg2rad(turn_deg)
-    forward = np.array([-np.cos(angle), -np.sin(angle), 0])
-    down = np.array([0, 0, -1.0])
-    R = np.stack([np.cross(down, forward), down, forward])
-    K = np.array([[80.0, 0, 31.5], [0, 80, 31.5], [0, 0, 1]])
-    return Camera(name, K, R, -R @ (np.array([0, 0, 1]) - 0.75 * forward), SIZE_PX, SIZE_PX)
+    like = Camera(name, np.diag([80.0, 80, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
+    angle, target_m, up = np.deg2rad(turn_deg), np.array([0.0, 0, 1]), np.array([0, 0, 1])
+    return look_at(like, target_m + 0.75 * np.array([np.cos(angle), np.sin(angle), 0]), target_m, up)
 
 
 def ball_fit() -> BodyFit:

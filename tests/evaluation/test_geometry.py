@@ -17,11 +17,6 @@ def cube(x_m: float = 0.0, side_m: float = 1.0) -> trimesh.Trimesh:
     return trimesh.creation.box([side_m] * 3).apply_translation([x_m, 0, 0])
 
 
-def joined(a: trimesh.Trimesh, b: trimesh.Trimesh) -> trimesh.Trimesh:
-    faces = np.concatenate([a.faces, b.faces + len(a.vertices)])
-    return trimesh.Trimesh(np.concatenate([a.vertices, b.vertices]), faces, process=False)
-
-
 def test_scores_of_parallel_planes_by_hand() -> None:
     score = score_geometry(plane(), plane(0.1), np.random.default_rng(0), samples=2000, nodes=16)
     assert score["chamfer_mm"] == pytest.approx(100.0, rel=1e-5)
@@ -45,7 +40,7 @@ def test_distances_are_to_the_surface_not_to_samples() -> None:
 def test_chamfer_averages_both_directions() -> None:
     """From a plane, the nearer of two others is 10 cm away everywhere. Of the two others, half is 10 cm away and half
     30 cm: 20 cm on average, and 0.05 m^2 squared."""
-    both = joined(plane(0.1), plane(0.3))
+    both = trimesh.util.concatenate(plane(0.1), plane(0.3))
     for pair in ((plane(), both), (both, plane())):
         score = score_geometry(*pair, np.random.default_rng(0), samples=4000, nodes=16)
         assert score["chamfer_mm"] == pytest.approx((100 + 200) / 2, rel=0.03)
@@ -55,7 +50,7 @@ def test_chamfer_averages_both_directions() -> None:
 def test_normal_consistency_averages_both_directions() -> None:
     """All of a plane is nearest to a parallel one. Of that one and a plane tilted by 60 degrees far above, half is
     parallel to it."""
-    both = joined(plane(0.1), plane(1.0, tilt_deg=60))
+    both = trimesh.util.concatenate(plane(0.1), plane(1.0, tilt_deg=60))
     for pair in ((plane(), both), (both, plane())):
         score = score_geometry(*pair, np.random.default_rng(0), samples=4000, nodes=16)
         assert score["normal_consistency"] == pytest.approx((1 + (1 + 0.5) / 2) / 2, abs=0.01)
@@ -87,7 +82,7 @@ def test_volume_overlap_of_offset_cubes() -> None:
 
 
 def test_hidden_layers_are_not_sampled() -> None:
-    both = joined(cube(), cube(side_m=0.8))
+    both = trimesh.util.concatenate(cube(), cube(side_m=0.8))
     points_m, normals = outer_samples(Surface(both), 3000, np.random.default_rng(0))
     assert np.abs(points_m).max(1) == pytest.approx(0.5)  # all on the outer cube
     assert len(points_m) == pytest.approx(3000 / 1.64, rel=0.05)  # the outer cube's fraction of 6 + 6 x 0.64 m^2
@@ -95,7 +90,7 @@ def test_hidden_layers_are_not_sampled() -> None:
 
 
 def test_occupancy_matches_the_winding_number_at_every_node() -> None:
-    mesh = joined(trimesh.creation.icosphere(2, 0.3), trimesh.creation.torus(0.5, 0.06))
+    mesh = trimesh.util.concatenate(trimesh.creation.icosphere(2, 0.3), trimesh.creation.torus(0.5, 0.06))
     surface, lower_m, upper_m = Surface(mesh), mesh.bounds[0] - 0.02, mesh.bounds[1] + 0.02
     axes = [np.linspace(a, b, 40) for a, b in zip(lower_m, upper_m, strict=True)]
     nodes_m = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
