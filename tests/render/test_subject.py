@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import math
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -257,58 +259,45 @@ def test_a_subject_with_a_truncated_file_is_refused_in_one_line(
     assert line.startswith(f"hnerf: {copy / named}: damaged, or written by another version (")
 
 
-def _set(**changes: object) -> Callable[[Path], object]:
-    """Return a function that replaces keys of a subject's capture."""
-
-    def change(subject: Path) -> None:
-        path = subject / "capture/capture.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-    return change
+def set_keys(subject: Path, camera: str = "", **changes: object) -> None:
+    """Replace keys of a subject's capture, or of one of its cameras."""
+    path = subject / "capture/capture.json"
+    content = json.loads(path.read_text())
+    (content["cameras"][camera] if camera else content).update(changes)
+    path.write_text(json.dumps(content))
 
 
-def _set_camera(**changes: object) -> Callable[[Path], object]:
-    """Return a function that replaces keys of camera 2 in a subject's capture."""
-
-    def change(subject: Path) -> None:
-        cameras = json.loads((subject / "capture/capture.json").read_text())["cameras"]
-        _set(cameras=cameras | {"2": cameras["2"] | changes})(subject)
-
-    return change
+def replace_text(file: str, old: str, new: str, subject: Path) -> None:
+    """Replace text in a file of a subject's calibration."""
+    text = (subject / "calibration" / file).read_text()
+    assert old in text
+    (subject / "calibration" / file).write_text(text.replace(old, new, 1))
 
 
-def _replace(file: str, old: str, new: str) -> Callable[[Path], object]:
-    """Return a function that replaces text in a file of a subject's calibration."""
-
-    def change(subject: Path) -> None:
-        text = (subject / "calibration" / file).read_text()
-        assert old in text
-        (subject / "calibration" / file).write_text(text.replace(old, new, 1))
-
-    return change
+def nest_deeply(subject: Path) -> None:
+    (subject / "calibration/intri.yml").write_text("a: " + "[" * 200_000)
 
 
 NONSENSE = {
-    "no training cameras": (_set(train_cameras=[]), "capture.json: damaged"),
-    "an unknown training camera": (_set(train_cameras=["zz"]), "capture.json: damaged"),
-    "no cameras": (_set(cameras={}), "capture.json: damaged"),
-    "an unknown axis": (_set(up="w"), "(up: w)"),
-    "a number as axis": (_set(up=3), "(up: 3)"),
-    "a word as frame rate": (_set(fps="x"), "capture.json: damaged"),
-    "a frame rate of zero": (_set(fps=0), "(fps: 0)"),
-    "words as size": (_set_camera(size_px=["a", "b"]), "capture.json: damaged"),
-    "an enormous size": (_set_camera(size_px=[10**9, 10**9]), "capture.json: declares"),
-    "a camera at NaN": (_set_camera(t_m=[float("nan")] * 3), "capture.json: camera 2: T holds a NaN"),
-    "a K of one number": (_set_camera(K=[[1]]), "capture.json: camera 2: K has 1 numbers"),
-    "no K": (_replace("intri.yml", "K_2:", "K_9:"), "calibration: damaged"),
-    "no rotation": (_replace("extri.yml", "Rot_2:", "Rot_9:"), "calibration: damaged"),
-    "no names": (_replace("intri.yml", "names:", "nam:"), "calibration: damaged"),
-    "a small K": (_replace("intri.yml", "rows: 3\n   cols: 3", "rows: 2\n   cols: 2"), "calibration: damaged"),
-    "deeply nested": (
-        lambda f: (f / "calibration/intri.yml").write_text("a: " + "[" * 200_000),
-        "calibration: damaged",
+    "no training cameras": (partial(set_keys, train_cameras=[]), "capture.json: damaged"),
+    "an unknown training camera": (partial(set_keys, train_cameras=["zz"]), "capture.json: damaged"),
+    "no cameras": (partial(set_keys, cameras={}), "capture.json: damaged"),
+    "an unknown axis": (partial(set_keys, up="w"), "(up: w)"),
+    "a number as axis": (partial(set_keys, up=3), "(up: 3)"),
+    "a word as frame rate": (partial(set_keys, fps="x"), "capture.json: damaged"),
+    "a frame rate of zero": (partial(set_keys, fps=0), "(fps: 0)"),
+    "words as size": (partial(set_keys, camera="2", size_px=["a", "b"]), "capture.json: damaged"),
+    "an enormous size": (partial(set_keys, camera="2", size_px=[10**9, 10**9]), "capture.json: declares"),
+    "a camera at NaN": (partial(set_keys, camera="2", t_m=[math.nan] * 3), "capture.json: camera 2: T holds a NaN"),
+    "a K of one number": (partial(set_keys, camera="2", K=[[1]]), "capture.json: camera 2: K has 1 numbers"),
+    "no K": (partial(replace_text, "intri.yml", "K_2:", "K_9:"), "calibration: damaged"),
+    "no rotation": (partial(replace_text, "extri.yml", "Rot_2:", "Rot_9:"), "calibration: damaged"),
+    "no names": (partial(replace_text, "intri.yml", "names:", "nam:"), "calibration: damaged"),
+    "a small K": (
+        partial(replace_text, "intri.yml", "rows: 3\n   cols: 3", "rows: 2\n   cols: 2"), "calibration: damaged"
     ),
-}
+    "deeply nested": (nest_deeply, "calibration: damaged"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", NONSENSE)
@@ -345,6 +334,6 @@ def test_a_subject_with_inconsistent_arrays_is_refused_in_one_line(
 def test_a_motion_of_another_version_is_refused_in_one_line(
     subject: Path, copy: Path, refusal: Callable[..., str]
 ) -> None:
-    _set(lens=1)(copy)
+    set_keys(copy, lens=1)
     line = refusal(subject, "--motion", str(copy))
     assert line.startswith(f"hnerf: {copy / 'capture/capture.json'}: damaged, or written by another version (")
