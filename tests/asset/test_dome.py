@@ -35,8 +35,3 @@ def test_the_dome_of_a_uniform_light_is_a_single_grey() -> None:
     picture, intensity = dome(Light(0.5 * np.eye(9)[0], 0.0))
     assert picture.shape == (HEIGHT_PX, 2 * HEIGHT_PX, 3)
     assert picture.min() >= 250 and abs(intensity - 0.5) < 0.01
-
-
-def test_the_dome_is_brightest_where_the_light_comes_from() -> None:
-    picture, _ = dome(Light(np.array([1, 0, 0, 0.5, 0, 0, 0, 0, 0]), 0.0))  # towards +X
-    assert picture[HEIGHT_PX // 2, HEIGHT_PX // 2, 0] > 240 > 50 + picture[HEIGHT_PX // 2, 3 * HEIGHT_PX // 2, 0]
