@@ -30,20 +30,21 @@ pytestmark = pytest.mark.usefixtures("any_surface")
 def test_an_interrupted_training_ends_like_an_uninterrupted_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ):
-    """A training interrupted after ten steps resumes from the checkpoint at six. It ends with the same weights, poses
-    and losses, bit by bit."""
+    """A training interrupted after five steps resumes from the checkpoint at three. It ends with the same weights,
+    poses and losses, bit by bit."""
     recording = record(tmp_path / "capture")
-    settings = tiny(kind, rays_per_frame=16)
+    few = {"steps": 6, "novel_pose_steps": 2, "absorb_steps": 2, "checkpoint_steps": 3}
+    settings = tiny(kind, rays_per_frame=16, **few)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     whole.mkdir()
     optimise = Trainer._optimise
 
-    def keep_at_ten(self, module):
-        if self.step == 10 and not parts.exists():
+    def keep_at_five(self, module):
+        if self.step == 5 and not parts.exists():
             shutil.copytree(whole, parts)
         return optimise(self, module)
 
-    monkeypatch.setattr(Trainer, "_optimise", keep_at_ten)
+    monkeypatch.setattr(Trainer, "_optimise", keep_at_five)
     train(*recording, settings, whole, ALONE)
     assert (parts / NAME).exists() and not (parts / "model.safetensors").exists()
     train(*recording, settings, parts, ALONE)
@@ -114,7 +115,7 @@ def test_the_paper_preset_reduces_its_nine_losses_and_fog(tmp_path: Path, monkey
 
 def test_a_model_loads_after_the_shape_has_changed(tmp_path: Path):
     """The extent of the grids comes from the body before its shape was tuned, also in the loaded avatar."""
-    trainer = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
+    trainer = Trainer(*record(tmp_path / "capture"), tiny(steps=2, novel_pose_steps=0), tmp_path, ALONE)
     with torch.no_grad():
         trainer.objective.correction.shape += 0.2  # 20 cm taller
     trainer.run()
