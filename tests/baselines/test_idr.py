@@ -25,10 +25,10 @@ def sphere(points: Tensor) -> Tensor:
     return points.norm(dim=-1) - 1
 
 
-def traced(distance, origins: Tensor, directions: Tensor, samples: int = 16) -> tuple[Tensor, Tensor]:
-    """Trace rays between depths 0 and 8."""
+def traced(distance, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Trace rays between depths 0 and 8, with 16 samples."""
     near, far = torch.zeros(len(origins)).to(origins), torch.full((len(origins),), 8.0).to(origins)
-    probe_depths = torch.linspace(0, 8, samples).to(origins).expand(len(origins), -1)
+    probe_depths = torch.linspace(0, 8, 16).to(origins).expand(len(origins), -1)
     rays = Rays(origins, directions, torch.zeros(len(origins), dtype=torch.long))
     return trace_surface(distance, rays, near, far, probe_depths, distance(rays.points(probe_depths)))
 

@@ -9,6 +9,7 @@ import all as module
 import pytest
 from all import make
 from freshness import load_records
+from registry import Result
 
 from tests.benchmarks.checkout import PROGRAM, Checkout, made
 
@@ -133,12 +134,11 @@ def test_files_no_longer_written_are_removed_and_writing_none_is_a_failure(
     checkout: Checkout, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checkout.write("benchmarks/results/one-old.md", "1")
-    both = made("one", program="program.py")
-    both = type(both)(both.name, both.command, ("one.md", "one-*.md"))
+    both = Result("one", ONE.command, ("one.md", "one-*.md"))
     assert make(checkout.root, [both], checkout.store, 1) == 0
     assert list(load_records(checkout.root)["one"]["files"]) == ["one.md"]
     assert not (checkout.root / "benchmarks" / "results" / "one-old.md").exists()
-    nothing = type(both)("nothing", ("program.py", "else", "{store}"), ("nothing.md",))
+    nothing = Result("nothing", ("program.py", "else", "{store}"), ("nothing.md",))
     assert make(checkout.root, [nothing], checkout.store, 1) == 1
     assert "wrote no file named nothing.md" in capsys.readouterr().err
 
@@ -163,7 +163,7 @@ def test_two_jobs_run_in_parallel(checkout: Checkout) -> None:
 
 def test_the_argument_new_is_a_folder_for_this_result_and_code(checkout: Checkout) -> None:
     before_writing(checkout, "(Path(store) / 'kept').touch()")
-    timed = type(ONE)("a/b", ("program.py", "b", "{new}"), ("b.md",))
+    timed = Result("a/b", ("program.py", "b", "{new}"), ("b.md",))
     assert make(checkout.root, [timed], checkout.store, 1) == 0
     digest = load_records(checkout.root)["a/b"]["digest"]
     assert (checkout.store / f"a-b-{digest[:12]}" / "kept").exists()

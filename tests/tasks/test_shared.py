@@ -167,15 +167,13 @@ def test_a_result_whose_upload_failed_is_shared_later(tmp_path: Path, monkeypatc
     made(bucket, Store(tmp_path / "there"), never)
 
 
-def resumed(
-    bucket: Bucket, store: Store, work: Callable[[Path], dict[str, float]], stage: str = "training"
-) -> Artifact:
-    """Get or compute the artifact of a stage that resumes from the file `checkpoint`."""
+def resumed(bucket: Bucket, store: Store, work: Callable[[Path], dict[str, float]]) -> Artifact:
+    """Get or compute the artifact of a training, which resumes from the file `checkpoint`."""
 
     def compute() -> Artifact:
-        return store.get_or_compute(stage, KEY, work, resumable=True)
+        return store.get_or_compute("training", KEY, work, resumable=True)
 
-    return get_or_compute(bucket, store, stage, KEY, compute, "checkpoint")
+    return get_or_compute(bucket, store, "training", KEY, compute, "checkpoint")
 
 
 def finish(out: Path) -> dict[str, float]:
