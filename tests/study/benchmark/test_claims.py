@@ -69,9 +69,10 @@ def test_more_is_better_at_every_step(psnr: tuple[float, ...], chamfer: tuple[fl
     assert verdict(result).startswith(seen)
 
 
-def test_variants_that_calibration_left_with_the_same_cameras_do_not_show_that_more_is_better() -> None:
+@pytest.mark.parametrize("check", ["more_is_better", "loses_least"])
+def test_variants_that_calibration_left_with_the_same_cameras_show_nothing(check: str) -> None:
     """Of four cameras, calibration leaves out two."""
-    result = synthetic_result("more_is_better")
+    result = synthetic_result(check)
     for scores_of_four in result["variants"]["4 cameras"]["methods"].values():
         scores_of_four["trained_on"]["cameras"] = 2
     assert verdict(result) == "no figures."
@@ -154,6 +155,24 @@ def test_only_bins_of_angles_that_both_methods_have_are_compared() -> None:
 def test_scores_of_new_poses_have_no_trend_with_pose_distance(slope: float, seen: str) -> None:
     """Without a slope, deviations of x are -45, -15, 15, 45 and of y 0, 1, -1, 0: -30 / sqrt(4500 x 2)."""
     assert verdict(synthetic_result("no_trend_with_pose", slope=slope)).startswith(seen)
+
+
+@pytest.mark.parametrize(
+    ("check", "images", "seen"),
+    [
+        ("falls_with_angle", 1, "no figures."),
+        ("falls_with_angle", 2, "yes: 4 cameras: fast 30.0 dB at 0°, 28.0 at 30°; "),
+        ("no_trend_with_pose", 2, "no figures."),
+        ("no_trend_with_pose", 3, "no: 4 cameras: correlation -0.97 over 3 images; "),
+    ],
+)
+def test_a_fall_takes_two_images_and_a_trend_three(check: str, images: int, seen: str) -> None:
+    """Deviations of x are -30, 0, 30 and of y 3, 1, -4: -210 / sqrt(1800 x 26). Through two points, any line fits."""
+    result = synthetic_result(check)
+    for variant in result["variants"].values():
+        for method in variant["methods"].values():
+            del method["novel_view"]["per_image"][images:]  # which are also those of novel poses
+    assert verdict(result).startswith(seen)
 
 
 @pytest.mark.filterwarnings("error")
