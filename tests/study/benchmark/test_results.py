@@ -26,6 +26,7 @@ from hnerf.study.benchmark.results import (
     scatter_points,
     smallest_timed_px,
     sweep_curves,
+    trivial_psnr,
 )
 
 MACHINE = {"cpu": "Abacus", "cores": 2, "threads": 1, "gpu": None, "torch": "2", "python": "3"}
@@ -67,7 +68,7 @@ def scores(psnr: float, frame_s: float, folder: str) -> dict[str, Any]:
         "novel_pose": unscored("no poses") | {"geometry": None, "geometry_reason": "no poses"},
         "novel_pose_posed": unscored("no poses"),
         "novel_pose_tracked": unscored("no poses"),
-        "frame_seconds": {"512": 4 * frame_s, "256": frame_s},
+        "frame_seconds": {"1024": 4 * frame_s, "256": frame_s},
         "pictures": [{"camera": "c", "frame": 0}],
         "folder": folder,
     }
@@ -120,7 +121,7 @@ def test_the_markdown_by_hand() -> None:
         "poses), curves on 1 images.",
         "",
         "| method | PSNR, dB | SSIM | mask IoU | LPIPS | Chamfer x1e-3 m² | NC | IoU | training, s | peak memory, GiB "
-        "| model, MiB | frame at 256 px, s | frame at 512 px, s | s to best - 1 dB |",
+        "| model, MiB | frame at 256 px, s | frame at 1024 px, s | s to best - 1 dB |",
         "|" + "---|" * 14,
         "| fast | 30.00 / - / - / - | 0.900 / - / - / - | 0.950 / - / - / - | 0.040 / - / - / - "
         "| 0.050 / - | 0.940 / - | 0.875 / - | 62 | 1.2 | 28.5 | 0.50 "
@@ -189,6 +190,19 @@ def test_cameras_that_calibration_left_out_are_noted_and_not_plotted() -> None:
     text = as_markdown(of_three, [], [])
     assert "- fast: trained on 3 cameras and 1 frames: calibration left the others out" in text
     assert sweep_curves(of_three)["fast"] == [(2, 28.0), (3, 30.0)]
+    of_three["variants"]["2 cameras"]["methods"]["fast"]["trained_on"] = {"cameras": 3, "frames": 1}
+    assert sweep_curves(of_three)["fast"] == [(3, 29.0)]
+
+
+def test_a_method_without_a_scored_image_has_no_curve_and_does_not_change_the_counts() -> None:
+    some = result()["variants"]["4 cameras"]
+    nothing = {"n": 0, "psnr": None, "empty_psnr": None, "one_colour_psnr": None}
+    some["methods"]["nerf"] |= {"curve": [nothing | {"seconds": 10.0}], "novel_view": split(26.0) | nothing}
+    lines = as_markdown(result(variants={"4 cameras": some}), [], [])
+    assert ". Scored on 2 / 0 images and 1 / 0 surfaces (new views / animated new poses), curves on 1 images." in lines
+    assert near_best_seconds(some).keys() == {"fast"}
+    del some["methods"]["fast"]
+    assert trivial_psnr(some) == near_best_seconds(some) == {}
 
 
 def test_the_csv_has_a_row_for_each_method_of_each_variant() -> None:
