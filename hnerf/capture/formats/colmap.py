@@ -94,6 +94,8 @@ def write_colmap(out: Path, lenses: Sequence[Lens]) -> None:
     folder = out / "sparse" / "0"
     folder.mkdir(parents=True, exist_ok=True)
     model.write_text(str(folder))
+    if not all(path.read_bytes().endswith(b"\n") for path in folder.glob("*.txt")):  # which pycolmap does not check
+        raise OSError(f"{folder}: cannot be written; is the disk full?")
 
 
 def _colmap_parameters(lens: Lens) -> tuple[str, list[float]]:

@@ -1,6 +1,7 @@
 """Camera files of other tools, read, written, and read back; numbers worked out by hand."""
 
 import dataclasses
+import resource
 import struct
 from pathlib import Path
 
@@ -178,6 +179,17 @@ def test_skew_cannot_be_written_for_colmap(tmp_path: Path) -> None:
     K = np.array([[1000.0, 40, 500], [0, 1000, 500], [0, 0, 1]])  # 40 px at one focal length off the axis
     with pytest.raises(InputError, match="camera 01: has skew"):
         write_colmap(tmp_path, [Lens("01", K, np.zeros(4), np.eye(3), np.zeros(3), (1000, 1000))])
+
+
+def test_a_colmap_model_cut_short_by_a_full_disk_is_an_error(tmp_path: Path) -> None:
+    """A limit on the size of files takes the place of the disk; pycolmap writes on."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (250, limits[1]))
+    try:
+        with pytest.raises(OSError, match="sparse/0: cannot be written; is the disk full"):
+            write_colmap(tmp_path, LENSES)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_colmap_projects_to_the_same_pixels(tmp_path: Path) -> None:
