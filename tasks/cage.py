@@ -140,6 +140,8 @@ def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object
         error = InputError(f"{opened}: {BEYOND[number]}; export it again")
     if isinstance(error, InputError):
         return {"error": "InputError", "arguments": [str(error)]}
+    if isinstance(error, OSError) and number is None:  # our own, for libraries that do not say why
+        return {"error": "OSError", "arguments": [str(error)]}
     if isinstance(error, OSError):
         named = error.filename2 or error.filename  # of a copy, the file that is written
         name = None if named is None else str(named)

@@ -103,6 +103,10 @@ def finds_no_space(folder: Path) -> None:
     raise OSError(28, "No space left on device", "/in", None, "/out")
 
 
+def cannot_write(folder: Path) -> None:
+    raise OSError("a.png: cannot be written; is the disk full?")
+
+
 def is_wrong(folder: Path) -> None:
     raise KeyError("camera")
 
@@ -152,6 +156,9 @@ def test_errors_of_the_machine_are_retryable_and_bugs_have_a_traceback(tmp_path:
     with pytest.raises(OSError, match="No space left on device") as raised:
         run_caged(finds_no_space, tmp_path, folder=tmp_path)
     assert (raised.value.errno, raised.value.filename) == (28, "/out")
+    with pytest.raises(OSError, match=r"^a\.png: cannot be written; is the disk full\?$") as raised:
+        run_caged(cannot_write, tmp_path, folder=tmp_path)
+    assert raised.value.errno is None
     with pytest.raises(LostWorkerError, match="its reader was killed by SIGKILL"):
         run_caged(is_killed, tmp_path, folder=tmp_path)
     with pytest.raises(RuntimeError, match=r"in is_wrong\n(.*\n)*KeyError: 'camera'"):
