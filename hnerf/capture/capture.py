@@ -283,5 +283,9 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     colour = pixels.ndim == 3
     as_stored = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], -1) if colour else np.ascontiguousarray(pixels)
-    if not cv2.imwrite(str(path), as_stored, JPEG_OPTIONS if path.suffix == ".jpg" else []):
-        raise OSError(f"{path}: cannot be written; is the disk full?")
+    # cv2.imwrite does not notice a full disk at the end of a PNG, which may be all of it.
+    encoded = cv2.imencode(path.suffix, as_stored, JPEG_OPTIONS if path.suffix == ".jpg" else [])[1].tobytes()
+    try:
+        path.write_bytes(encoded)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None

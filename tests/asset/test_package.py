@@ -1,6 +1,5 @@
 import dataclasses
 import itertools
-import resource
 import time
 from pathlib import Path
 from zipfile import ZipFile
@@ -21,6 +20,7 @@ from hnerf.asset.validation import each_variant
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from tests.asset.figure import FRAMES, INFO, bending_body, write_all
+from tests.full_disk import files_up_to
 
 
 def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
@@ -384,13 +384,8 @@ def test_cache_holds_the_posed_points(package: Path, staged: StagedAvatar) -> No
 
 @pytest.mark.parametrize("missing", [0.5, 1e-4], ids=["the layer", "the package"])
 def test_a_full_disk_is_named_as_such(missing: float, staged: StagedAvatar, tmp_path: Path) -> None:
-    """A limit on the size of files, of which the packed one is the largest, takes the place of the disk."""
+    """The packed file is the largest."""
     path = tmp_path / "avatar.usdz"
     write_usdz(path, {"": staged}, [], 10.0, INFO)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (int((1 - missing) * path.stat().st_size), limits[1]))
-    try:
-        with pytest.raises(OSError, match="is the disk full"):
-            write_usdz(path, {"": staged}, [], 10.0, INFO)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with files_up_to(int((1 - missing) * path.stat().st_size)), pytest.raises(OSError, match="is the disk full"):
+        write_usdz(path, {"": staged}, [], 10.0, INFO)

@@ -1,4 +1,4 @@
-"""How much of an image a distortion leaves, which lenses are accepted, and how captures are named."""
+"""How much of an image a distortion leaves, which lenses are accepted, how captures are named, and full disks."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hnerf.capture.capture import write_image
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.manifest import CaptureManifest, capture_name
 from hnerf.capture.normalise import kept_share
 from hnerf.errors import InputError
+from tests.full_disk import files_up_to
 
 
 def test_kept_share_by_hand() -> None:
@@ -31,3 +33,9 @@ def test_skew_is_accepted_only_without_distortion(skew: float, k1: float, refuse
 def test_a_decomposed_folder_name_is_composed() -> None:
     composed, decomposed = "J\u00fcrgen", "Ju\u0308rgen"
     assert capture_name(Path("/recordings") / decomposed, CaptureManifest()) == composed
+
+
+@pytest.mark.parametrize("name", ["mask.png", "image.jpg"])
+def test_an_image_on_a_full_disk_is_an_error(name: str, tmp_path: Path) -> None:
+    with files_up_to(100), pytest.raises(OSError, match=rf"File too large: .*{name}"):
+        write_image(tmp_path / name, np.zeros((60, 60), np.uint8))

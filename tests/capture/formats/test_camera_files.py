@@ -1,7 +1,6 @@
 """Camera files of other tools, read, written, and read back; numbers worked out by hand."""
 
 import dataclasses
-import resource
 import struct
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from hnerf.capture.lens import Lens
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture import recordings as rec
+from tests.full_disk import files_up_to
 
 CAMERAS_TXT = "# Camera list\n1 SIMPLE_RADIAL 640 480 500 320 240 0.1\n2 PINHOLE 24 16 20 21 12 8\n"
 # A quarter turn about x, quaternion w x y z = (cos 45, sin 45, 0, 0): y goes to z, z to -y.
@@ -182,14 +182,8 @@ def test_skew_cannot_be_written_for_colmap(tmp_path: Path) -> None:
 
 
 def test_a_colmap_model_cut_short_by_a_full_disk_is_an_error(tmp_path: Path) -> None:
-    """A limit on the size of files takes the place of the disk; pycolmap writes on."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (250, limits[1]))
-    try:
-        with pytest.raises(OSError, match="sparse/0: cannot be written; is the disk full"):
-            write_colmap(tmp_path, LENSES)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with files_up_to(250), pytest.raises(OSError, match="sparse/0: cannot be written; is the disk full"):
+        write_colmap(tmp_path, LENSES)
 
 
 def test_colmap_projects_to_the_same_pixels(tmp_path: Path) -> None:
