@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from hnerf.detection.person_detector import anchors, decode_boxes, weighted_nms
+from hnerf.detection import person_detector
+from hnerf.detection.person_detector import PersonDetector, anchors, decode_boxes, weighted_nms
 
 
 def test_anchors_are_cell_centres_layer_by_layer() -> None:
@@ -39,3 +40,19 @@ def test_overlapping_boxes_are_averaged_by_score() -> None:
     assert [found[0, 0] for found in people] == pytest.approx([0.32, 1.2])
     assert people[0][2] == pytest.approx([0.32, 1])
     assert weighted_nms(np.zeros((0, 6, 2)), np.zeros(0)) == []
+
+
+def test_a_detected_person_is_placed_in_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network sees pixels from -1 to 1 in a square of 400 px, 100 px of it above the image. The anchor in its
+    middle has the hips a tenth of the square below it, and the top of the circle around the person a tenth above."""
+    raw, logits, middle = np.zeros((2254, 12)), np.full((2254, 1), -9.0), 1960 + 6 * (3 * 7 + 3)
+    raw[middle, 2:8], logits[middle] = [22.4, 22.4, 0, 22.4, 0, -22.4], 9
+
+    def network(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        assert (image.min(), image.max()) == (-1, 1)
+        return raw, logits
+
+    monkeypatch.setattr(person_detector, "Network", lambda name: network)
+    (found,) = PersonDetector()(np.full((200, 400, 3), 255, np.uint8))
+    assert found.centre_px == pytest.approx([199.5, 139.5])
+    assert found.side_px == pytest.approx(200) and found.angle == pytest.approx(0)

@@ -375,6 +375,7 @@ def test_the_command_prints_the_table(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_a_method_that_is_named_twice_is_run_once(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("methods: [fast]\nseeds: [0]\ndegradations: {skirt: [0.02]}")
     table = stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", ["fast", "fast"])
     assert table.name == "ada-mine.md"  # as in the study: not a part of it
     assert "| degradation | fast |\n" in table.read_text()
