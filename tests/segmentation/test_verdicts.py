@@ -53,6 +53,13 @@ def test_an_area_jump_must_contradict_both_neighbours_and_prior(stride: int) -> 
     assert found == {2 * stride: "area jumps from 100 to 200 px"}
 
 
+def test_a_hole_is_a_jump_and_masks_with_a_fault_are_neither_judged_nor_neighbours() -> None:
+    """The fifth mask has lost 70 px; all but the last of those after it have a fault, so the last has no neighbours."""
+    areas = [100, 100, 100, 100, 30, 900, 900, 900, 900, 100]
+    verdicts = [MaskVerdict("too large" if area == 900 else None, None, area) for area in areas]
+    assert area_jumps(tuple(range(10)), verdicts, [50] * 10) == {4: "area jumps from 100 to 30 px"}
+
+
 def test_a_mask_is_compared_with_near_frames_only() -> None:
     looked_at = list[object]()
 
