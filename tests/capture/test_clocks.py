@@ -56,10 +56,10 @@ def test_missing_images_are_not_replaced_by_images_of_another_time() -> None:
 
 
 def test_uneven_frames_are_all_used_and_none_replaces_a_dropped_one() -> None:
-    video = Video(Path("b"), (0, 1, 2, 3, 4, 5), None, (0.0, 0.1, 0.21, 0.3, 0.6, 0.7))  # two dropped after 0.3 s
-    found = in_step({"a": images("a", 7, 10), "b": video}, {"a": Clock(), "b": Clock(0.04)}, 30)
-    # a's instants 4 and 5 are 0.44 and 0.54 s: 0.14 and 0.06 s from a frame
-    assert found["b"].own == pytest.approx({0: 0.4, 1: 1 + 4 / 11, 2: 2 + 3 / 9, 3: 3 + 4 / 30, 6: 4.4})
+    video = Video(Path("b"), (0, 1, 2, 3, 4, 5), None, (0.0, 0.1, 0.24, 0.3, 0.6, 0.7))  # two dropped after 0.3 s
+    found = in_step({"a": images("a", 7, 10), "b": video}, {"a": Clock(), "b": Clock(0.06)}, 30)
+    # a's instants 1, 3 and 4 are 0.16, 0.36 and 0.46 s: 0.06, 0.06 and 0.14 s from a frame; 1 is between neighbours
+    assert found["b"].own == pytest.approx({0: 0.6, 1: 1 + 6 / 14, 2: 2 + 2 / 6, 5: 3 + 26 / 30, 6: 4.6})
 
 
 def test_of_equally_slow_cameras_one_with_even_frames_sets_the_instants() -> None:
