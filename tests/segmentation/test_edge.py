@@ -17,14 +17,6 @@ def test_the_plate_at_an_edge_is_as_dark_as_the_image_next_to_it():
     assert shaded[20, 0] == pytest.approx(100)  # nothing near it shows the ground
 
 
-def test_an_unshaded_plate_stays_as_it_is():
-    plate = np.random.default_rng(0).integers(0, 256, (20, 20, 3)).astype(np.uint8)
-    mask = np.zeros((20, 20), bool)
-    mask[5:15, 5:15] = True
-    image = np.where(mask[..., None], 255 - plate, plate)
-    assert shaded_plate(mask, image, plate) == pytest.approx(plate.astype(float), abs=0.01)
-
-
 def test_a_mask_that_ends_within_the_person_leaves_the_plate_unshaded():
     """A grey person stands in front of a varied wall in shadow. If the mask is 4 px too small, the person is just
     outside it, with a brightness that no shadow on the wall explains. With the right mask, the wall is just outside."""
