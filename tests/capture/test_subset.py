@@ -60,6 +60,8 @@ def test_a_subject_named_in_a_camera_left_out_is_named_in_another(tmp_path: Path
     few = Capture.load(tmp_path / "few")
     assert few.subject_point is not None and few.subject_point.camera == "c0"
     assert share_right(subject_keypoints(few), {name: each[1][name] for name in ("c0", "c2")}) == 1
+    subset(capture, tmp_path / "kept", ("c1", "c2"), None, None)
+    assert Capture.load(tmp_path / "kept").subject_point == capture.subject_point
 
 
 def test_a_subject_named_in_a_frame_left_out_is_named_in_another(tmp_path: Path) -> None:
