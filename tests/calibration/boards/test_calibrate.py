@@ -117,6 +117,14 @@ def test_offsets_are_in_frames_of_the_footage() -> None:
     assert max(figures["turned_deg"] for figures in compare_pairs(cameras, fit.cameras).values()) < 0.3
 
 
+def test_frames_across_a_gap_are_not_neighbours() -> None:
+    cameras, frames = rig(), [first + i for first in (0, 20, 40, 60) for i in range(4)]
+    fit = solve_rig(cameras, planar_corners(corners_of(seen(cameras, {"b": LAG}, frames), frames)))
+    for figures in compare_pairs(cameras, fit.cameras).values():
+        assert figures["turned_deg"] < 1 and figures["moved_cm"] < 2
+    assert np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0]) == pytest.approx(LAG, abs=0.1)
+
+
 def test_off_plane_corners_and_images_with_few_corners_are_dropped() -> None:
     corners_px = seen(rig(), {})[:1, :2]
     corners_px[0, 0, 7] += [3.0, 0]
