@@ -68,7 +68,7 @@ class TrainedAvatar:
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Render colour, coverage and depth of the person alone."""
         bodies, conditions = self._pose(theta, root)
-        scene = self.field.scene(bodies, conditions)
+        scene = dataclasses.replace(self.field.scene(bodies, conditions), pixel_rad=1 / camera.K[0, 0])
         device = bodies.vertices_m.device
         at_once = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
         at_once *= GPU_BATCHES if device.type == "cuda" else 1

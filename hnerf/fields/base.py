@@ -86,7 +86,7 @@ class Field(nn.Module, ABC):
         """Record the progress of the field's training, from 0 to 1. Called once after each step but the last, however
         many parts a step has."""
 
-    def samples_needed(self, region: Any, rays: Rays) -> Tensor:
+    def samples_needed(self, scene: PosedScene[Any], rays: Rays) -> Tensor:
         """Return the number of samples that rendering takes along R rays: (R,) long, 0 where nothing is visible."""
         return torch.full((len(rays),), self.samples, device=rays.frame.device)
 
@@ -107,7 +107,7 @@ class Field(nn.Module, ABC):
 
     def _by_samples(self, scene: PosedScene[Any], rays: Rays) -> Iterator[tuple[Tensor, Draws]]:
         """Yield the rays that see anything, (N,) long, grouped by their number of samples, with their draws."""
-        needed = self.samples_needed(scene.region, rays)
+        needed = self.samples_needed(scene, rays)
         for count in needed[needed > 0].unique().tolist():
             pick = torch.nonzero(needed == count)[:, 0]
             yield pick, Draws.deterministic(len(pick), count, rays.frame.device)

@@ -38,12 +38,14 @@ class Rays:
 @dataclass(frozen=True)
 class PosedScene(Generic[Region]):
     """The scene in which rays are evaluated, by body row: the posed bodies, the field's sampling region around them and
-    its conditions. correction: the change of poses and shape that is being learned; None in rendering."""
+    its conditions. correction: the change of poses and shape that is being learned; None in rendering. pixel_rad: the
+    angle between neighbouring pixels of the image that is rendered; None if there is none."""
 
     bodies: PosedBodies
     region: Region
     conditions: Conditions
     correction: PoseCorrection | None = None
+    pixel_rad: float | None = None
 
     def with_noise(self, sigma: float, generator: torch.Generator) -> "PosedScene[Region]":
         """Return the scene with noise on its conditions."""

@@ -80,9 +80,11 @@ class ShellGrid:
         inside = wanted - cumulative.gather(1, upper - 1)
         return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0, ends
 
-    def path_length_m(self, rays: Rays) -> Tensor:
-        """Return the path length (R,) in metres over which `sample_rays` distributes the samples."""
-        return self.cell_m * self._march(rays)[1][:, -1]
+    def path_m(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """Return the length of the path over which `sample_rays` distributes the samples, and the depth at which rays
+        enter the grid, (R,) each, in metres."""
+        edges, cumulative, _ = self._march(rays)
+        return self.cell_m * cumulative[:, -1], edges[:, 0]
 
     def _march(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
         """Return depths (R, B + 1) of equal steps through the grid; the number of steps before each that are in the

@@ -75,6 +75,23 @@ def test_ray_batches_are_limited_by_their_number_of_samples(subject: Path, monke
     assert len(at_once) > 1 and at_once[0] == max(at_once) == 256
 
 
+def test_fields_know_the_angle_of_a_pixel(subject: Path, monkeypatch: pytest.MonkeyPatch):
+    """Twice the resolution halves it."""
+    capture, _, body = record(subject / "capture")
+    avatar, pixels_rad = load_avatar(subject, "cpu"), []
+
+    def noted(scene: PosedScene[object], rays: Rays) -> Tensor:
+        pixels_rad.append(scene.pixel_rad)
+        return torch.zeros(len(rays), 5)
+
+    monkeypatch.setattr(avatar.field, "render_rays", noted)
+    camera = capture.cameras["0"]
+    for seen in (camera, camera.scaled(2)):
+        avatar.render(seen, body.theta[0], body.root[0])
+    assert pixels_rad[0] == pytest.approx(1 / camera.K[0, 0])
+    assert pixels_rad[-1] == pytest.approx(pixels_rad[0] / 2, rel=0.05)
+
+
 def test_of_frames_in_the_same_pose_the_one_nearest_in_position_is_used():
     """Two frames have the same joint angles and are 1 m apart. A place 40 cm from the first is nearer to it."""
     theta, root = torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1)

@@ -144,13 +144,25 @@ def test_adaptive_sample_counts_render_the_same_as_many_samples(monkeypatch: pyt
     directions = torch.nn.functional.normalize(directions, dim=-1)
     rays = Rays(origins, directions, torch.zeros(4, dtype=torch.long))
     scene = field.scene(bodies, conditions)
-    needed = scene.region.path_length_m(rays) / SPACING_M
+    needed = scene.region.path_m(rays)[0] / SPACING_M
     assert len({sum(float(n) > count for count in SAMPLE_COUNTS) for n in needed}) >= 3
     found = field.render_rays(scene, rays)
     monkeypatch.setattr(FastField, "samples_needed", Field.samples_needed)
     expected = field.render_rays(scene, rays)
     torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
     assert (found[:3, 3] > 0.5).all() and not found[3].any()
+
+
+@pytest.mark.parametrize(
+    ("pixel_m", "samples"), [(None, 12), (0.1, 12), (0.003, 12), (0.002, 18), (0.001, 36), (1e-6, 36)]
+)
+def test_samples_are_four_pixels_apart_in_close_ups(pixel_m: float | None, samples: int):
+    """10 cm of shell in samples of 12 mm, of 8 mm if a pixel covers 2 mm, and of 3 mm at the closest are 8.3, 12.5 and
+    33.3 samples."""
+    region = SimpleNamespace(path_m=lambda rays: (torch.tensor([0.1]), torch.tensor([2.0])))
+    bodies, conditions = standing()
+    scene = PosedScene(bodies, region, conditions, pixel_rad=pixel_m and pixel_m / 2)
+    assert field_of(200.0).samples_needed(scene, from_above((0.5, 0.5, 3.0))).tolist() == [samples]
 
 
 def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
@@ -170,7 +182,7 @@ def test_rendered_rays_end_at_the_solid_core_if_the_surface_lies_deeper():
     field = deeper_by(0.1)
     rays = from_above((0.5, 0.5, 3.0), (-0.05, 0.5, 3.0))
     scene = field.scene(bodies, conditions)
-    count = int(field.samples_needed(scene.region, rays)[0])
+    count = int(field.samples_needed(scene, rays)[0])
     draws = Draws.deterministic(2, count, torch.device("cpu"))
     with torch.no_grad():
         samples, depths = field.sample(scene, rays, draws)

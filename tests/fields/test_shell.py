@@ -109,8 +109,9 @@ def test_samples_lie_in_the_shell_in_front_of_the_solid_core():
     origins_m, directions = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]), torch.eye(3)[[0, 0]]
     rays = Rays(origins_m, directions, torch.zeros(2, dtype=torch.long))
     depths, met, ended = grid.sample_rays(rays, torch.full((2, 16), 0.5))
-    path_length_m = grid.path_length_m(rays)
-    assert path_length_m[0].item() == pytest.approx(0.09, abs=0.03) and path_length_m[1] == 0
+    length_m, start_m = grid.path_m(rays)
+    assert length_m[0].item() == pytest.approx(0.09, abs=0.03) and length_m[1] == 0
+    assert start_m[0].item() == pytest.approx(0.63, abs=0.01)  # two cells before the shell
     assert met.tolist() == ended.tolist() == [True, False]
     assert (depths[0].diff() > 0).all()
     assert depths[0, 0].item() == pytest.approx(0.65, abs=0.03)
