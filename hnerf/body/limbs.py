@@ -17,6 +17,7 @@ FIRST_JOINTS = ("upperarm01.L", "upperarm01.R", "upperleg01.L", "upperleg01.R") 
 CLOSE_M = 0.06  # from skin to skin; with 10 cm, renderings of valid-walk and valid-wave are the same
 CLOSER_THAN_AT_REST = 0.5  # share of the distance at rest; limbs are always close where they join
 SAMPLE_CELL_M = 0.04  # one vertex in each of these cells represents the others
+NEAR_M = 10.0  # cdist sums products of coordinates: 100 m from the origin, it is off by centimetres
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ class Limbs:
 def _distances_m(points_m: Tensor, limb: Tensor) -> Tensor:
     """Return the distance of points (P, 3), on limbs (P,), from the points of each limb, (P, L); infinite for a limb
     without points, and for a point's own limb."""
-    distance_m = torch.cdist(points_m, points_m)
+    near_m = points_m - NEAR_M * (points_m.mean(0) / NEAR_M).round()
+    distance_m = torch.cdist(near_m, near_m)
     nowhere = distance_m.new_full((len(points_m), 1), torch.inf)
     columns = [torch.cat([distance_m[:, limb == k], nowhere], 1).amin(1) for k in range(len(FIRST_JOINTS) + 1)]
     return torch.stack(columns, 1).scatter(1, limb[:, None], torch.inf)

@@ -85,6 +85,15 @@ def test_only_limbs_that_moved_closer_than_at_rest_are_close() -> None:
     assert CLOSE_M == 0.06
 
 
+def test_limbs_are_as_close_wherever_the_person_stands() -> None:
+    """A kilometre from the origin, single precision is good for 0.1 mm; no distance is so near the limit of 6 cm."""
+    limbs, posed_m = limbs_rig().limbs, swung(0.21).vertices_m
+    close = limbs.close(posed_m)
+    assert 10 < close.sum() < 200
+    for place_m in ((1003.0, -504.0, 2.0), (56.0, 0.0, 34.0)):
+        assert torch.equal(limbs.close(posed_m + torch.tensor(place_m)), close)
+
+
 def test_a_point_between_two_limbs_is_described_by_both() -> None:
     """With a slope of 0.2, the arm's face is 4 cm from the trunk at 0.8 m below the shoulder. A point 1 cm from the
     trunk is 3 cm from the arm, times the cosine of the slope. Farther up, where they are apart, the arm is not
