@@ -45,7 +45,7 @@ class Board(BaseModel):
     columns: int = Field(ge=3, le=64)
     rows: int = Field(ge=3, le=64)
     square_m: float = Field(ge=1e-4, le=2)
-    dictionary: str | None = Field(default=None, pattern=r"^DICT_[A-Z0-9_]{1,32}$")
+    dictionary: str | None = Field(default=None, pattern=r"^DICT_[A-Za-z0-9_]{1,32}$")
     marker_share: float = Field(default=0.75, ge=0.1, le=0.99)
     inverted: bool = False
     legacy_pattern: bool = False

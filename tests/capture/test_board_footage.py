@@ -74,6 +74,13 @@ def test_a_board_may_be_described_in_capture_toml(tmp_path: Path) -> None:
     assert read_board(tmp_path) == Board(columns=7, rows=6, square_m=0.1)
 
 
+@pytest.mark.parametrize("dictionary", ["DICT_APRILTAG_36h11", "DICT_APRILTAG_36H11"])
+def test_a_dictionary_may_have_either_of_its_names_in_opencv(dictionary: str, tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO.replace("DICT_4X4_1000", dictionary))
+    board = read_board(tmp_path)
+    assert board is not None and BoardDetector(board).charuco is not None
+
+
 @pytest.mark.parametrize(
     ("table", "message"),
     [
