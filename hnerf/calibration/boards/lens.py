@@ -13,6 +13,7 @@ MAX_PICTURES = 40  # evenly spaced
 MIN_PICTURES = 10
 MIN_TILTED = 5  # images; boards parallel to the image plane say nothing about the focal length or its error
 TILT_DEG = 15.0
+K3_SIGMAS = 5.0  # standard deviations that k3 must exceed: few lenses need it, and it bends images beyond the corners
 MAX_FOCAL_STD = 0.01  # relative standard deviation up to which a focal length is trusted
 
 
@@ -41,8 +42,8 @@ class LensEstimate:
 
 
 def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size_px: tuple[int, int]) -> LensEstimate:
-    """Estimate intrinsics and distortion k1 k2 p1 p2 from corners_px (F, N, 2) as recorded, NaN where not seen (Zhang
-    2000).
+    """Estimate intrinsics and distortion k1 k2 p1 p2, and k3 if the images prove it, as those of wide lenses do, from
+    corners_px (F, N, 2) as recorded, NaN where not seen (Zhang 2000).
 
     The standard deviation is that of the least squares (cv2.calibrateCameraExtended).
     """
@@ -54,9 +55,13 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
     seen = [np.isfinite(corners_px[f, :, 0]) for f in chosen]
     points_m = [corners_m[s].astype(np.float32) for s in seen]
     points_px = [corners_px[f, s].astype(np.float32) for f, s in zip(chosen, seen, strict=True)]
-    _, K, distortion, turns, _, deviation, _, _ = cv2.calibrateCameraExtended(
-        points_m, points_px, size_px, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
-    )
-    lens = Lens(name, K, distortion.ravel()[:4], np.eye(3), np.zeros(3), size_px)
+    for flags in (0, cv2.CALIB_FIX_K3):
+        _, K, distortion, turns, _, deviation, _, _ = cv2.calibrateCameraExtended(
+            points_m, points_px, size_px, np.eye(3), np.zeros(5), flags=flags
+        )
+        needs_k3 = abs(distortion.ravel()[4]) > K3_SIGMAS * deviation[8, 0]
+        if needs_k3:
+            break
+    lens = Lens(name, K, distortion.ravel()[: 5 if needs_k3 else 4], np.eye(3), np.zeros(3), size_px)
     tilted = sum(abs(cv2.Rodrigues(turn)[0][2, 2]) < np.cos(np.deg2rad(TILT_DEG)) for turn in turns)
     return LensEstimate(len(chosen), lens, tilted, float(max(deviation[0, 0] / K[0, 0], deviation[1, 0] / K[1, 1])))

@@ -201,10 +201,10 @@ def test_a_visible_board_faces_the_camera_is_inside_the_image_and_found_by_anoth
     assert visible[:, 2].tolist() == [True, True, False] and found[:, 2].tolist() == [False, False, True]
 
 
-def close_up(tilt: float) -> np.ndarray:
+def close_up(tilt: float, k3: float = 0.0) -> np.ndarray:
     """Return corners (20, N, 2) seen through a lens of 900 px and k1 = -0.2. tilt: up to how many radians the board is
     turned about each axis."""
-    K, distortion = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0])
+    K, distortion = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0, k3])
     rng = np.random.default_rng(1)
     poses = [(rng.uniform(-tilt, tilt, 3), rng.uniform([-0.3, -0.2, 0.6], [0.1, 0.05, 0.6])) for _ in range(20)]
     views = [cv2.projectPoints(BOARD.corners_m, r, t, K, distortion)[0].reshape(-1, 2) for r, t in poses]
@@ -219,7 +219,15 @@ def test_a_lens_is_reliable_only_if_the_images_determine_it() -> None:
     )
     assert tilted.reliable_lens is not None and tilted.reliable_lens.K[0, 0] == pytest.approx(900, rel=0.005)
     assert tilted.reliable_lens.distortion[0] == pytest.approx(-0.2, abs=0.02)
+    assert len(tilted.reliable_lens.distortion) == 4  # noise does not prove k3
     assert facing.reliable_lens is None and few.reliable_lens is None and few.pictures == 9
+
+
+def test_a_lens_that_two_radial_terms_cannot_express_gets_a_third() -> None:
+    """Without k3, that of a wide lens becomes an error of the other terms."""
+    lens = estimate_lens("a", BOARD.corners_m, close_up(0.7, k3=-0.3), (1280, 720)).reliable_lens
+    assert lens is not None and lens.K[0, 0] == pytest.approx(900, rel=0.002)
+    assert lens.distortion[[0, 1, 4]] == pytest.approx([-0.2, 0.05, -0.3], abs=0.05)
 
 
 def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
