@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("detection", version="5", resumable=True)
+@stage("detection", version="6", resumable=True)
 def detect(out: Path, recording: Artifact, source: str | None, size: str) -> dict[str, float]:
     """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
     finished. source, size: of DetectionSettings, whose other fields do not change the result."""
@@ -35,7 +35,7 @@ def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
     return settings.source in ("network", "both") or (settings.source is None and (silent or flat))
 
 
-@stage("hands", version="1")
+@stage("hands", version="2")
 def find_hands(out: Path, recording: Artifact) -> dict[str, float]:
     """Write the recording with keypoints of hands. Return the lowest share of hands found in any camera."""
     return {"least_found": min(detect_hands(Capture.load(recording.root), out).values())}

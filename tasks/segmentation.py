@@ -14,7 +14,7 @@ from tasks.store import Artifact
 EDGE_MOVEMENT = "moved_px"
 
 
-@stage("segmentation", version="14")
+@stage("segmentation", version="15")
 def segment(
     out: Path,
     recording: Artifact,

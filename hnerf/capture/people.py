@@ -188,8 +188,12 @@ def _most_probable_sequence(
     and its mean score: Viterbi with a cost for jumps in the image beyond what is typical of the recording. A person who
     is not seen stays where last seen."""
     shown = [_picked_keypoints([p[i] for p in people], found.picks) for i, found in enumerate(candidates)]
-    best = [[one[:1] for one in frame] for frame in shown]
-    free_jump = FREE_JUMPS * float(np.median([_jump(a, b)[0, 0] for a, b in pairwise(best)])) if len(best) > 1 else 0.0
+    steps = []
+    for (was, now), (before, after) in zip(pairwise(shown), pairwise(candidates), strict=True):
+        both = ((before.picks[0] >= 0) & (after.picks >= 0)).mean(1).clip(1e-9)
+        jumps = _jump([one[:1] for one in was], now)[0] / both
+        steps.append(jumps[after.score >= after.score[0] / 2].min())  # the best ones may show two people in turn
+    free_jump = FREE_JUMPS * float(np.median(steps)) if steps else 0.0
     last, total, back = shown[0], candidates[0].score, []
     for now, (picks, _, score) in zip(shown[1:], candidates[1:], strict=True):
         best_before = total[:, None] - JUMP_COST * _jump(last, now, free_jump)

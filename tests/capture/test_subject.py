@@ -82,6 +82,18 @@ def test_two_people_who_cross_are_told_apart(tmp_path: Path) -> None:
     assert share_right(dict(zip(names, people[1].keypoints, strict=True)), other) > 0.9
 
 
+def test_people_who_are_most_prominent_in_turn_are_told_apart(tmp_path: Path) -> None:
+    """They are 1.6 m apart. One camera misses each of them in every other frame, and the other person in the next."""
+    cameras = ring(4)
+    _, each = recorded(tmp_path, cameras, walking((-1.2, -0.8), (1.2, -0.8)), walking((1.2, 0.8), (-1.2, 0.8)))
+    for first, person in enumerate(each):
+        person["c0"][first::2] = 0
+    found = people.follow_people(cameras, [np.stack([one[c.name] for one in each], 1) for c in cameras])
+    tracks = [dict(zip(each[0], track.keypoints, strict=True)) for track in found]
+    for person in each:
+        assert max(share_right(track, person) for track in tracks) > 0.97
+
+
 @pytest.mark.parametrize("cameras", [1, 4])
 def test_a_poster_is_not_taken_for_the_subject(cameras: int, tmp_path: Path) -> None:
     """It hangs in the middle, larger than the subject, and never moves."""
