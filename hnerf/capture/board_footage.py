@@ -27,6 +27,7 @@ from hnerf.errors import InputError
 
 MAX_FRAMES = 200  # evenly strided frames of each camera in which the board is searched for
 MAX_TABLE_BYTES = 2_000_000  # of timestamps.csv: a hundred thousand rows
+MIN_CHECKERBOARD = 4  # squares on a side: OpenCV takes three corners for a row
 BOARDS_FILE = "boards.npz"
 METRES = {"inch": 0.0254, "cm": 0.01}
 
@@ -177,6 +178,11 @@ def read_board(folder: Path) -> Board | None:
             return None
         source, table = charuco, _from_caliscope(charuco)
     board = validated(Board, table, f"{source}: board")
+    if board.dictionary is None and min(board.columns, board.rows) < MIN_CHECKERBOARD:
+        raise InputError(
+            f"{source}: OpenCV finds no checkerboard of {board.columns} x {board.rows} squares; use one with at least "
+            f"{MIN_CHECKERBOARD} on each side, or a ChArUco board"
+        )
     if board.dictionary is None and (board.columns + board.rows) % 2 == 0:
         raise InputError(
             f"{source}: a checkerboard of {board.columns} x {board.rows} squares looks the same upside down; "

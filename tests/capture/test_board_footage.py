@@ -85,6 +85,7 @@ def test_a_dictionary_may_have_either_of_its_names_in_opencv(dictionary: str, tm
     ("table", "message"),
     [
         ("columns = 6\nrows = 8\nsquare_m = 0.1", "looks the same upside down"),
+        ("columns = 3\nrows = 4\nsquare_m = 0.1", "OpenCV finds no checkerboard of 3 x 4 squares"),
         ("columns = 100000\nrows = 5\nsquare_m = 0.1", "board: columns"),
         ('columns = 4\nrows = 5\nsquare_m = 0.1\ndictionary = "DICT_4X4_9"', "not one of OpenCV's"),
         ('columns = 4\nrows = 5\nsquare_m = 0.1\ndictionary = "os.system"', "board: dictionary"),
