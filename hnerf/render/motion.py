@@ -14,7 +14,7 @@ from hnerf.avatar.finished import readable
 from hnerf.body.body_model import body_model
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import initial_pose_from_given
-from hnerf.body.rig import joint_transforms, pose_vertices
+from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
@@ -30,6 +30,7 @@ AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, whi
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
 HIPS = ("upperleg01.L", "upperleg01.R")
+LEG = "upperleg01.L", "foot.L"
 DEFAULT_FPS = 30.0  # of AMASS files without a rate
 BELOW_FLOOR = 0.05  # share of a motion's frames with a foot below its floor, due to errors
 MAX_MOTION_BYTES = 256_000_000  # unpacked; half an hour of SMPL-H at 100 poses a second
@@ -93,10 +94,11 @@ def select_poses(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
 def retarget(own: BodyFit, motion: Motion, up: str, source: object = "motion") -> BodyFit:
     """Return the motion's poses on the rig of `own`, with the rotations of joints matched by name.
 
-    The middle of the hips follows its path on the motion's own body, unscaled, so that standing legs keep standing
-    while the trunk bends. The path is shifted so that its mean position coincides with that of `own`. The motion's
-    floor, which 5 % of its frames reach below, is put on that of `own`: the median of its lowest points, on which the
-    asset stands. In each frame the lowest point keeps the height above the floor that it had on the motion's own body.
+    The middle of the hips follows its path on the motion's own body, so that standing legs keep standing while the
+    trunk bends, scaled by the length of the legs, so that a standing foot does not slide while the hips pass over it.
+    The path is shifted so that its mean position coincides with that of `own`. The motion's floor, which 5 % of its
+    frames reach below, is put on that of `own`: the median of its lowest points, on which the asset stands. In each
+    frame the lowest point keeps the height above the floor that it had on the motion's own body.
     `up`: the vertical axis of the world of `own`. Raises InputError, naming `source`, if the motion lacks a joint.
     """
     other, names = motion.body, motion.body.rig.joint_names
@@ -109,7 +111,7 @@ def retarget(own: BodyFit, motion: Motion, up: str, source: object = "motion") -
     turn = torch.eye(4)
     turn[:3, :3] = torch.from_numpy(y_up_from(up).T @ y_up_from(motion.up))
     placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)
-    hips_m = middle_of_hips_m(other) @ turn[:3, :3].T
+    hips_m = _leg_m(own.rig) / _leg_m(other.rig) * (middle_of_hips_m(other) @ turn[:3, :3].T)
     placed = set_middle_of_hips(placed, hips_m + middle_of_hips_m(own).mean(0) - hips_m.mean(0))
     lowest_m = lowest_points_m(other, motion.up)
     above_floor_m = lowest_m - lowest_m.quantile(BELOW_FLOOR)  # the motion may be in the air half of the time
@@ -135,6 +137,14 @@ def middle_of_hips_m(body: BodyFit) -> Tensor:
     """Return the middle of the hip joints, (n, 3), in the world; the root joint of a rig without legs."""
     hips = [j for j, name in enumerate(body.rig.joint_names) if name in HIPS] or [0]
     return joint_transforms(body.rig, body.theta, body.root)[:, hips, :3, 3].mean(1)
+
+
+def _leg_m(rig: Rig) -> float:
+    """Return the distance from hip to ankle at rest; 1 for a rig without legs."""
+    if not set(LEG) <= set(rig.joint_names):
+        return 1.0
+    hip_m, ankle_m = (rig.joints_m[rig.joint_names.index(name)] for name in LEG)
+    return float(torch.dist(hip_m, ankle_m))
 
 
 def set_middle_of_hips(body: BodyFit, points_m: Tensor) -> BodyFit:

@@ -16,6 +16,7 @@ from hnerf.errors import InputError
 from hnerf.progress import Progress, listening
 from hnerf.render.motion import (
     HIPS,
+    LEG,
     Motion,
     _read_amass,
     interpolate_poses,
@@ -88,6 +89,18 @@ def test_hips_stay_in_place_while_the_trunk_pitches(up: str) -> None:
     found = retarget(own, Motion(other if up == "z" else in_y_up(other), 10.0, up), "z")
     hip_m = joint_transforms(found.rig, found.theta, found.root)[:, 1, :3, 3]
     torch.testing.assert_close(hip_m[:, :2], torch.tensor([[0.5, 2], [0.5, 2]]))
+
+
+def test_the_path_of_the_hips_is_scaled_by_the_legs() -> None:
+    """The other body's legs are twice as long, and it moves by 1 m along x."""
+    own, other = (
+        dataclasses.replace(
+            body, rig=dataclasses.replace(body.rig, joint_names=(LEG[0], *body.rig.joint_names[1:-1], LEG[1]))
+        )
+        for body in (bending_body(), giant())
+    )
+    found = retarget(own, Motion(other, 10.0, "z"), "z")
+    torch.testing.assert_close(found.root[:, :2, 3], torch.tensor([[0.25, 2], [0.75, 2]]))
 
 
 @pytest.mark.parametrize("up", ["z", "y"])
