@@ -42,7 +42,8 @@ def _named(motions: Iterable[Path]) -> dict[str, Motion]:
     for path in motions:
         called = path.resolve().name if path.is_dir() else path.stem  # a subject's name may have dots
         name = re.sub(r"\W+", "_", called, flags=re.ASCII).strip("_")
-        if not 0 < len(name) <= LONGEST_NAME or name in found or name.startswith(CAPTURED):
+        same = name.lower()  # payloads are named after motions, and Windows and macOS ignore case
+        if not 0 < len(name) <= LONGEST_NAME or same in map(str.lower, found) or same.startswith(CAPTURED):
             why = f"empty, longer than {LONGEST_NAME}, reserved or already in use"
             raise InputError(f"{path}: motion name {name!r} is {why}; rename the file")
         found[name] = read_motion(path)

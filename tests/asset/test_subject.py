@@ -43,7 +43,9 @@ def test_motions_are_named_after_their_files(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "out").is_dir()
 
 
-@pytest.mark.parametrize("names", [["a.bvh", "sub/a.npz"], ["captured_24.bvh"], ["!.bvh"], [f"{240 * 'a'}.bvh"]])
+@pytest.mark.parametrize(
+    "names", [["a.bvh", "sub/A.npz"], ["captured_24.bvh"], ["Captured.bvh"], ["!.bvh"], [f"{240 * 'a'}.bvh"]]
+)
 def test_names_that_clash_are_refused(names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exported, "read_motion", lambda path: Motion(bending_body(), 25.0, "z"))
     with pytest.raises(InputError, match="rename the file"):
