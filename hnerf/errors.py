@@ -3,10 +3,11 @@
 import errno
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-# Failures to read that say nothing about the file: a stale or unreachable share, a failing disk, a busy machine.
+# Failures to read that say nothing about the file: a stale or unreachable share, one whose program (FUSE) has ended, a
+# failing disk, a busy machine.
 UNREACHABLE = (
-    errno.EIO, errno.ESTALE, errno.EREMOTEIO, errno.ETIMEDOUT, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.EMFILE,
-    errno.ENFILE, errno.ENOMEM,
+    errno.EIO, errno.ESTALE, errno.EREMOTEIO, errno.ETIMEDOUT, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOTCONN,
+    errno.ECONNABORTED, errno.EMFILE, errno.ENFILE, errno.ENOMEM,
 )  # fmt: skip
 REASON = "hnerf: "  # begins the line on standard error that says why a process ends
 MAX_MESSAGE = 2000  # characters; text from a stranger's file may be longer

@@ -166,9 +166,10 @@ def test_unreadable_files_and_folders_are_bad_input(folder: Path, monkeypatch: p
         read_capture(folder)
 
 
-def test_a_share_that_is_away_is_not_bad_input(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "sha256_of", Mock(side_effect=OSError(errno.ESTALE, "Stale file handle")))
-    with pytest.raises(OSError, match="Stale file handle"):
+@pytest.mark.parametrize("away", [errno.ESTALE, errno.ENOTCONN, errno.ECONNABORTED])  # the last two: sshfs has ended
+def test_a_share_that_is_away_is_not_bad_input(folder: Path, monkeypatch: pytest.MonkeyPatch, away: int) -> None:
+    monkeypatch.setattr(module, "sha256_of", Mock(side_effect=OSError(away, os.strerror(away))))
+    with pytest.raises(OSError, match=os.strerror(away)):
         read_capture(folder)
 
 
