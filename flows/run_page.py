@@ -22,6 +22,7 @@ from hnerf.evaluation.pictures import data_uri, shrunk
 from hnerf.progress import Progress, listening
 
 UPDATE_S = 10.0  # between updates of the progress of one piece of work
+SLOW_S = 5.0  # for an update; after one that takes longer, the work goes on for ten times as long without another
 PICTURE_PX = 640  # longest side on the page; the server stores the bytes in its database
 
 log = logging.getLogger("hnerf.run_page")
@@ -62,12 +63,14 @@ class _ProgressPage:
     def __init__(self) -> None:
         self.artifacts: dict[str, UUID] = {}
         self.next_s: dict[str, float] = {}
+        self.silent_until_s = 0.0
 
     def show(self, progress: Progress) -> None:
-        """Show a progress report; if it cannot be shown, the work continues."""
+        """Show a progress report; if it cannot be shown, the work continues. It waits meanwhile, and Prefect repeats
+        the request for minutes if the server is away."""
         key, now = slug(progress.what), time.monotonic()
         ended = progress.done >= progress.total
-        due = now >= self.next_s.setdefault(key, now + UPDATE_S)
+        due = now >= max(self.silent_until_s, self.next_s.setdefault(key, now + UPDATE_S))
         if not (due or (ended and key in self.artifacts)):
             return
         self.next_s[key] = now + UPDATE_S
@@ -79,6 +82,8 @@ class _ProgressPage:
                 self.artifacts[key] = cast(UUID, create_progress_artifact(percent, key=key, description=progress.what))
         except Exception as error:  # the server is away
             log.debug("progress is not shown: %s", error)
+        if (took_s := time.monotonic() - now) > SLOW_S:
+            self.silent_until_s = now + 11 * took_s
         if ended:
             self.artifacts.pop(key, None)
 

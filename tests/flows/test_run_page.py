@@ -70,6 +70,24 @@ def test_an_unreachable_server_does_not_end_the_work(monkeypatch: pytest.MonkeyP
     create.assert_called_once()
 
 
+def test_a_server_that_is_away_delays_the_work_by_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prefect repeats a request for a minute even if the server refuses each at once."""
+    clock_s = 0.0
+
+    def create(*_: object, **__: object) -> None:
+        nonlocal clock_s
+        clock_s += 76.0
+        raise ConnectionError("refused")
+
+    monkeypatch.setattr(run_page, "create_progress_artifact", create)
+    monkeypatch.setattr(run_page, "time", Mock(monotonic=lambda: clock_s))
+    page = run_page._ProgressPage()
+    for done in range(4000):
+        clock_s += 1.0
+        page.show(Progress(f"camera {done // 100}", done % 100, 100))
+    assert 4000 + 4 * 76 < clock_s < 1.15 * 4000
+
+
 def test_images_are_shrunk_and_embedded(tmp_path: Path) -> None:
     Image.new("RGBA", (1280, 320), (255, 0, 0, 255)).save(tmp_path / "a.png")
     text = embedded([("front", tmp_path / "a.png")])
