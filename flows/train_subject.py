@@ -27,8 +27,8 @@ from tasks.ledger import forget
 from tasks.limits import set_limits
 from tasks.quarantine import clear, note_run
 from tasks.quiet import EXPECTED
-from tasks.remote import NothingThereError, fetched, remote_capture
-from tasks.source import place, read_capture
+from tasks.remote import fetched, remote_capture
+from tasks.source import NothingThereError, place, read_capture
 from tasks.stage import retried
 from tasks.store import OPTIONAL, Artifact, Store
 from tasks.training import train
@@ -70,7 +70,11 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
     capture = place(capture)
-    source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
+    try:
+        source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
+    except NothingThereError:  # so that it may be started again from wherever it is now
+        forget(artifact_store.root, capture)
+        raise
     recorded = ingest(artifact_store, source, settings.capture)
     normalised = Capture.load(recorded.root)
     held_out_cameras(normalised.train_cameras, normalised.test_cameras, settings.evaluation.holdout)
@@ -136,15 +140,13 @@ def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
 
 
 def local_folder(store: Store, capture: Path | str) -> Path:
-    """Return a capture's folder or video; fetch it if it is in a bucket. If it cannot be found, release it, so that it
-    may be started again from wherever it is now."""
+    """Return a capture's folder or video; fetch it if it is in a bucket. If the bucket cannot be reached, release the
+    capture, so that it may be started again."""
     if isinstance(capture, Path):
-        if not capture.exists():
-            forget(store.root, capture)
         return capture
     try:
         found = retried(remote_capture)(capture)
-    except (NothingThereError, BucketError):
+    except BucketError:
         forget(store.root, capture)
         raise
     return fetched(store, found)

@@ -12,12 +12,9 @@ from hnerf.errors import InputError
 from hnerf.progress import tracked
 from tasks.bucket import Bucket, RemoteFile
 from tasks.packed import require_room
+from tasks.source import NothingThereError
 from tasks.stage import stage
 from tasks.store import Store
-
-
-class NothingThereError(InputError):
-    """There is no file at a URL."""
 
 
 @dataclass(frozen=True)

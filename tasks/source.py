@@ -15,6 +15,10 @@ GROUND_TRUTH = "ground_truth"
 MAX_FILE_BYTES = 1 << 38  # a sparse file takes no disk space, but hours to read
 
 
+class NothingThereError(InputError):
+    """There is no file at a path or URL."""
+
+
 def place(given: Path | str) -> Path | str:
     """Return a path, or the URL of something in a bucket. file:// URLs become paths. Raises InputError for an empty
     text, which as a path would be the current folder."""
@@ -39,12 +43,12 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
     also be a single video, which has no ground truth.
 
     Hidden files do not count. A symbolic link counts as the path that it holds: its target is either in the folder
-    itself or not part of it. Raises InputError if there is no such folder, a file cannot be read, or the store is
-    inside the capture, whose digest would then change with every run.
+    itself or not part of it. Raises NothingThereError if there is no such folder, and InputError if a file cannot be
+    read, or the store is inside the capture, whose digest would then change with every run.
     """
     folder = folder.resolve()
     if not folder.exists():
-        raise InputError(f"{folder}: no such folder or video; give the capture's folder")
+        raise NothingThereError(f"{folder}: no such folder or video; give the capture's folder")
     if store and store.resolve().is_relative_to(folder):
         raise InputError(f"{store.resolve()}: lies in the capture's folder; give --store another folder")
     shown = os.fsencode(folder).decode(errors="replace")

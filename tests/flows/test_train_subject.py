@@ -1,5 +1,6 @@
 """The order of the stages in the flow, with fake stages that record their inputs."""
 
+import errno
 import inspect
 import json
 from collections.abc import Callable, Iterable
@@ -85,6 +86,31 @@ def test_a_capture_in_a_bucket_is_fetched(folder: Path, s3: str, tmp_path: Path)
     assert given(trained.subject, "fit") == ["capture", "calibration", "segmentation"]
     assert [path.read_text() for path in (tmp_path / "store" / "fetched").glob("*/ada/intri.yml")] == ["cameras"]
     assert (trained.subject / ".recording").read_text().splitlines()[1] == url
+
+
+def test_the_first_look_at_a_capture_is_retried_too(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stale, exists = [OSError(errno.ESTALE, "Stale file handle")], Path.exists
+
+    def look(path: Path) -> bool:
+        if path == folder and stale:
+            raise stale.pop()
+        return exists(path)
+
+    def tried_twice(read: Callable[..., Any]) -> Callable[..., Any]:
+        def read_twice(*given: object) -> Any:
+            try:
+                return read(*given)
+            except OSError:
+                return read(*given)
+
+        return read_twice
+
+    monkeypatch.setattr(Path, "exists", look)
+    monkeypatch.setattr(module, "retried", tried_twice)
+    train_subject.fn(folder, "demo", tmp_path / "store", [])
+    assert not stale
 
 
 @pytest.mark.parametrize(("mark", "stage"), [("undetected", "detection"), ("handed", "hands")])

@@ -6,7 +6,8 @@ from fsspec import filesystem
 
 from hnerf.errors import InputError
 from tasks.bucket import VARIABLE, Bucket
-from tasks.remote import NothingThereError, fetched, remote_capture, remote_captures
+from tasks.remote import fetched, remote_capture, remote_captures
+from tasks.source import NothingThereError
 from tasks.store import Store
 
 
