@@ -17,6 +17,7 @@ from prefect.events import emit_event
 from pydantic import Field
 
 from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
+from hnerf.config import load_settings
 from hnerf.errors import InputError
 from tasks import quarantine
 from tasks.bucket import is_visible
@@ -65,6 +66,7 @@ def ingest_captures(
     for lost, why in restart_crashed(max_restarts):
         capture = place(lost.parameters["capture"])
         quarantine.note_run(capture, store, f"failed: {why} (flow run {lost.name}, {lost.id})")
+    load_settings(preset)  # a misspelled one would use up every capture: failed runs are not started again
     started: list[str] = []
     room: int | None = None
     for capture, listing in _unseen(folder, ledger, settle_s):

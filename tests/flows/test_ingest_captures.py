@@ -60,6 +60,12 @@ def test_each_capture_is_started_once(watched: Path, runs: list[dict[str, Any]])
     assert [Path(run["capture"]).name for run in runs] == ["ada", "bob"]
 
 
+def test_a_misspelled_preset_uses_up_no_capture(watched: Path, runs: list[dict[str, Any]]) -> None:
+    with pytest.raises(InputError, match="fsat: no such preset"):
+        ingest_captures.fn(watched, "fsat", watched.parent / "store", 0.0)
+    assert not runs and look(watched) == ["ada", "bob"]
+
+
 def test_a_copy_or_a_new_name_is_the_same_capture_and_changed_content_a_new_one(watched: Path) -> None:
     look(watched)
     shutil.copytree(watched / "ada", watched / "copy of ada")
