@@ -217,7 +217,8 @@ class Store:
                 path.parent, other, folder,
             )  # fmt: skip
         if before != claimed:
-            replace_text(path, claimed)
+            with unless_read_only():
+                replace_text(path, claimed)
 
     def claim_table(self, table: Path, digest: str, folder: Path) -> None:
         """Note next to a study's table which recording it belongs to, and create its folder. Raises InputError if there

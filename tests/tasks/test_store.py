@@ -244,7 +244,8 @@ def test_a_complete_store_can_be_read_only(tmp_path: Path, monkeypatch: pytest.M
     for name in ("replace", "unlink", "symlink", "rename", "open"):
         monkeypatch.setattr(os, name, Mock(side_effect=OSError(errno.EROFS, "Read-only file system")))
     assert store.get_or_compute("fit", "k", never) == made
-    store.claim("ada", "d", tmp_path / "captures" / "ada")
+    for mounted in ("captures", "elsewhere"):
+        store.claim("ada", "d", tmp_path / mounted / "ada")
     assert store.link_latest("ada", made) == made
 
 
