@@ -3,6 +3,7 @@
 import base64
 import os
 import re
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -61,6 +62,16 @@ def replace_text(path: Path, text: str) -> None:
     encoded = text.encode()
     with atomic_file(path) as beside, beside.open("xb") as file:  # never through a link that lies there
         file.write(encoded)
+
+
+def copy_folder(source: Path, target: Path) -> None:
+    """Copy the files of a folder into another one. Unlike `shutil.copytree`, end at the first error: a full disk would
+    be reported once for every file."""
+    for path in source.rglob("*"):
+        if path.is_file():
+            copy = target / path.relative_to(source)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
 
 
 def markdown_image(name: str) -> str:

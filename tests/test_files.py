@@ -1,3 +1,4 @@
+import errno
 import os
 from pathlib import Path
 from unittest.mock import Mock
@@ -5,7 +6,8 @@ from unittest.mock import Mock
 import pytest
 
 from hnerf.errors import InputError
-from hnerf.files import atomic_file, atomic_folder, made_folder, replace_text
+from hnerf.files import atomic_file, atomic_folder, copy_folder, made_folder, replace_text
+from tests.full_disk import files_up_to
 
 
 def test_an_atomic_folder_gets_its_name_once_it_is_complete(tmp_path: Path) -> None:
@@ -37,6 +39,17 @@ def test_a_dangling_link_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "out").symlink_to(tmp_path / "nothing")
     with pytest.raises(InputError, match="out: exists"), atomic_folder(tmp_path / "out"):
         raise AssertionError("too late")
+
+
+def test_copying_ends_at_the_first_file_for_which_there_is_no_room(tmp_path: Path) -> None:
+    (tmp_path / "ada" / "images").mkdir(parents=True)
+    for name in ("a.jpg", "b.jpg"):
+        (tmp_path / "ada" / "images" / name).write_bytes(b"pixels")
+    with files_up_to(4), pytest.raises(OSError) as full:
+        copy_folder(tmp_path / "ada", tmp_path / "copy")
+    assert full.value.errno == errno.EFBIG and Path(full.value.filename2).parent == tmp_path / "copy" / "images"
+    copy_folder(tmp_path / "ada", tmp_path / "copy")
+    assert {path.read_bytes() for path in (tmp_path / "copy" / "images").iterdir()} == {b"pixels"}
 
 
 def test_made_folders_are_removed_if_they_stay_empty(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import os
-import shutil
 import signal
 import time
 import zlib
@@ -28,6 +27,7 @@ from hnerf.detection.people import PICTURE, REPORT, check_subject, draw_people, 
 from hnerf.detection.person_detector import PersonDetector
 from hnerf.detection.tracker import track
 from hnerf.errors import InputError
+from hnerf.files import copy_folder
 from hnerf.models import POSE_DETECTOR, model_file
 from hnerf.processes import end_with_parent
 from hnerf.progress import report as report_progress
@@ -59,7 +59,7 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     people = to_body_25({name: people["points_px"] for name, people in found.items()}, "blazepose_33")
     for name, points in people.items():  # keypoints that the network guesses outside the image count as not seen
         points *= capture.cameras[name].holds(points[..., :2])[..., None]
-    shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns(KEYPOINTS), dirs_exist_ok=True)
+    copy_folder(capture.root, out)
     write_points(out / KEYPOINTS, people if alone else _with_own(capture, people))
     detected = Capture.load(out)
     ranked = ranked_people(detected)

@@ -2,7 +2,6 @@
 forearm ends."""
 
 import math
-import shutil
 import threading
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import write_points
 from hnerf.detection.network import Network
 from hnerf.detection.region import Region
+from hnerf.files import copy_folder
 from hnerf.models import HAND_LANDMARKS
 from hnerf.progress import tracked
 from hnerf.side_by_side import side_by_side
@@ -49,7 +49,7 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
     found = list(tracked(side_by_side(find, images), "hands", len(images)))
     stacked = np.stack(found).reshape(len(capture.train_cameras), len(capture.frames), 2, POINTS, 3)
     by_camera = dict(zip(capture.train_cameras, stacked, strict=True))
-    shutil.copytree(capture.root, out, dirs_exist_ok=True)
+    copy_folder(capture.root, out)
     write_points(out / HANDS, by_camera)
     return {name: float((hands[..., 0, 2] > FOUND).mean()) for name, hands in by_camera.items()}
 
