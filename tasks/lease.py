@@ -112,7 +112,14 @@ def _is_gone(text: bytes) -> bool:
     number meanwhile, it counts as alive."""
     owner, _, rest = text.decode(errors="replace").partition(" ")
     number = owner.rpartition(":")[2]
-    return rest.partition(" ")[0] == _place() and number.isdecimal() and not Path(f"/proc/{number}").exists()
+    if rest.partition(" ")[0] != _place() or not number.isdecimal():
+        return False
+    try:
+        with suppress(PermissionError):  # it is another user's, whose processes /proc may hide
+            os.kill(int(number), 0)
+    except (ProcessLookupError, OverflowError):
+        return True
+    return False
 
 
 @cache

@@ -1,3 +1,4 @@
+import os
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -93,6 +94,16 @@ def test_a_dead_owner_is_replaced_at_once_on_its_own_machine(bucket: Bucket) -> 
         began_s = time.monotonic()
         with leased(bucket, NAME) as mine:
             assert mine and least_s <= time.monotonic() - began_s < most_s
+
+
+def test_a_process_of_another_user_is_not_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even if /proc is mounted with hidepid, and does not show it."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    text = f"host:{gone.pid} {lease._place()} 5".encode()
+    assert lease._is_gone(text) and lease._is_gone(text.replace(b":", b":9999999999"))
+    monkeypatch.setattr(os, "kill", Mock(side_effect=PermissionError))
+    assert not lease._is_gone(text)
 
 
 def test_released_work_can_be_taken_at_once(bucket: Bucket) -> None:
