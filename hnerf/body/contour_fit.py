@@ -157,25 +157,23 @@ def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.n
 
 
 def refine_with_outlines(
-    problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, ground: int | None,
-    threads: int,
-) -> Pose:  # fmt: skip
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], ground: int | None, threads: int
+) -> Pose:
     """Refine a pose by Gauss-Newton steps on outlines and keypoints, renewing the matches before each step.
 
     edges: by frame and camera, None without a mask; ground: the world's vertical axis if a single camera sees a person
     standing at height 0, else None; threads: number of frames to process in parallel.
     """
-    sole_m = 0.0
-    for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
-        pose, sole_m, before_mm = _outline_step(problem, pose, edges, settings, ground, sole_m, threads)
-        log.info("outlines, step %d of %d: %.1f mm rms", step + 1, settings.contour_steps, before_mm)
+    sole_m, steps = 0.0, problem.settings.contour_steps
+    for step in tracked(range(steps), "outlines", steps):
+        pose, sole_m, before_mm = _outline_step(problem, pose, edges, ground, sole_m, threads)
+        log.info("outlines, step %d of %d: %.1f mm rms", step + 1, steps, before_mm)
     return pose
 
 
 def _outline_step(
-    problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, ground: int | None,
-    sole_m: float, threads: int,
-) -> tuple[Pose, float, float]:  # fmt: skip
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], ground: int | None, sole_m: float, threads: int
+) -> tuple[Pose, float, float]:
     """Return the pose after one step, the median height of the skin above the ground, and the residuals before the step
     (root mean square, mm). sole_m: that height from the previous step."""
     faces, cameras = pose.rig.faces.numpy(), problem.observations.cameras
@@ -187,7 +185,7 @@ def _outline_step(
         vertices_m = articulation.surface(skin, t).numpy()
         normals = normals_of(vertices_m, faces)
         found = [
-            match(camera, edge, float(scale_m[t]), vertices_m, normals, faces, settings)
+            match(camera, edge, float(scale_m[t]), vertices_m, normals, faces, problem.settings)
             for camera, scale_m, edge in zip(cameras, problem.scale_m, edges[t], strict=True)
             if edge is not None
         ]

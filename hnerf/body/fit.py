@@ -23,7 +23,7 @@ from hnerf.body.given_start import given_poses_note, initial_pose_from_given, ob
 from hnerf.body.ground import Ground, is_ground
 from hnerf.body.hand_points import PalmTerm, has_fingers, observe_hands
 from hnerf.body.initial_root import root_from_image, root_from_space
-from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
+from hnerf.body.keypoint_fit import Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.limb_depths import observe_limb_depths
 from hnerf.body.observations import Observations, observe, runs
 from hnerf.body.pose_prior import PosePrior, Smoothness
@@ -104,7 +104,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 terms |= {"ground": Ground(up, each_foot=True)} if on_ground else {}
                 problem = replace(problem, palm=palm, posture_prior=posture_prior, **terms)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
-                pose = refine_with_outlines(problem, pose, edges, settings, up if on_ground else None, threads)
+                pose = refine_with_outlines(problem, pose, edges, up if on_ground else None, threads)
             with timed("clothes", seconds, log):
                 pose = refine_with_clothing(problem, pose, edges, threads)
         if palm and masks is not None:
@@ -202,18 +202,9 @@ def make_problem(
 ) -> Problem:  # fmt: skip
     """Return the least-squares problem at a pose; `offsets` and `proportions` scale the standard deviations of the
     keypoint offsets and of the shape's details."""
-    priors = FitPriors(
-        settings.keypoint_m,
-        settings.keypoint_outlier_m,
-        settings.offset_m * offsets,
-        settings.stature_m,
-        settings.stature_std_m,
-        model.mean,
-        torch.where(model.details, proportions * model.std, model.std),
-        model.low,
-        model.high,
-    )
-    return Problem(observations, metres_per_pixel(observations.cameras, pose), priors, smoothness, model.rig)
+    model = replace(model, std=torch.where(model.details, proportions * model.std, model.std))
+    settings = settings.model_copy(update={"offset_m": offsets * settings.offset_m})
+    return Problem(observations, metres_per_pixel(observations.cameras, pose), model, settings, smoothness)
 
 
 def _by_split(capture: Capture) -> list[list[int]]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Points, Pose, with_offsets
 from hnerf.body.balance import Balance
+from hnerf.body.body_model import BodyModel
 from hnerf.body.ground import Ground
 from hnerf.body.hand_points import PalmTerm
 from hnerf.body.limb_depths import LimbDepths
@@ -17,8 +18,8 @@ from hnerf.body.observations import Observations
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.posture_prior import PosturePrior
 from hnerf.body.reprojection import NEAR_M, DataTerm, reprojection_term
-from hnerf.body.rig import Rig
 from hnerf.body.robust import geman_mcclure
+from hnerf.config import FitSettings
 from hnerf.geometry.camera import Camera
 
 ROOT = np.arange(6)  # the root's unknowns among those of a frame
@@ -26,23 +27,9 @@ ROOT_INFORMATION = 1e-6  # keeps a root where it is if nothing else determines i
 
 
 @dataclass(frozen=True)
-class FitPriors:
-    """Priors of a fit: standard deviations in metres; mean, standard deviation and range of the shape, each (B,)."""
-
-    keypoint_m: float
-    keypoint_outlier_m: float
-    offset_m: float
-    stature_m: float
-    stature_std_m: float
-    beta_mean: Tensor
-    beta_std: Tensor
-    beta_low: Tensor
-    beta_high: Tensor
-
-
-@dataclass(frozen=True)
 class Problem:
     """The least-squares problem of a fit: observations and priors, from which it assembles normal equations at a pose.
+    The model has the prior on its shape; the settings have those on offsets and stature, and the errors of keypoints.
 
     Shared unknowns: beta (B,), then the keypoint offsets (75,), then the median turns of the posture prior. scale_m (C,
     n): metres a pixel spans at the person, held fixed, since residuals would otherwise shrink as the body comes nearer.
@@ -52,9 +39,9 @@ class Problem:
 
     observations: Observations
     scale_m: Tensor
-    priors: FitPriors
+    model: BodyModel
+    settings: FitSettings
     smoothness: Smoothness
-    reshape: Callable[[Tensor], Rig]
     balance: Balance | None = None
     ground: Ground | None = None
     posture_prior: PosturePrior | None = None
@@ -91,13 +78,13 @@ class Problem:
     def _add_shape_prior(self, equations: NormalEquations, pose: Pose) -> float:
         """Add Gaussians on the shape, on the keypoint offsets, and on the stature, which determines monocular depth;
         return the cost."""
-        priors, rig = self.priors, pose.rig
+        model, settings, rig = self.model, self.settings, pose.rig
         offsets = pose.offsets_m.flatten()
-        values = torch.cat([rig.beta - priors.beta_mean, offsets])
-        precision = torch.cat([priors.beta_std, torch.full_like(offsets, priors.offset_m)]) ** -2
+        values = torch.cat([rig.beta - model.mean, offsets])
+        precision = torch.cat([model.std, torch.full_like(offsets, settings.offset_m)]) ** -2
         top, bottom = rig.vertices_m[:, 2].argmax(), rig.vertices_m[:, 2].argmin()
-        excess = float(rig.vertices_m[top, 2] - rig.vertices_m[bottom, 2] - priors.stature_m) / priors.stature_std_m
-        by_beta = ((rig.shape_basis[:, top, 2] - rig.shape_basis[:, bottom, 2]) / priors.stature_std_m).numpy()
+        excess = float(rig.vertices_m[top, 2] - rig.vertices_m[bottom, 2] - settings.stature_m) / settings.stature_std_m
+        by_beta = ((rig.shape_basis[:, top, 2] - rig.shape_basis[:, bottom, 2]) / settings.stature_std_m).numpy()
         shape = slice(0, len(by_beta))
         at = np.arange(len(values))
         equations.shared[at, at] += precision.numpy()
@@ -111,26 +98,26 @@ class Problem:
         known = self.observations.space_m.isfinite().all(-1)
         residual = torch.where(known[..., None], x - self.observations.space_m.nan_to_num(), 0.0)
         squared, trust, eye = residual.square().sum(-1), known.to(x.dtype), torch.eye(3, dtype=x.dtype)
-        weight, cost = geman_mcclure(squared, self.priors.keypoint_m, self.priors.keypoint_outlier_m)
+        weight, cost = geman_mcclure(squared, self.settings.keypoint_m, self.settings.keypoint_outlier_m)
         weight = trust * weight
         return weight[..., None, None] * eye, weight[..., None] * residual, float((trust * cost).sum())
 
     def image_term(self, x: Tensor) -> DataTerm:
         """Return the data term of reprojected keypoints, with pixel residuals converted to metres."""
         return reprojection_term(
-            self.observations, self.scale_m, x, self.priors.keypoint_m, self.priors.keypoint_outlier_m
+            self.observations, self.scale_m, x, self.settings.keypoint_m, self.settings.keypoint_outlier_m
         )
 
     def apply_step(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:
         """Return the pose after a damped Gauss-Newton step, with its rig linearised again."""
         beta = pose.rig.beta
         unbounded = torch.full((len(equations.shared) - len(beta),), torch.inf)
-        low = torch.cat([self.priors.beta_low - beta, -unbounded]).numpy()
-        high = torch.cat([self.priors.beta_high - beta, unbounded]).numpy()
+        low = torch.cat([self.model.low - beta, -unbounded]).numpy()
+        high = torch.cat([self.model.high - beta, unbounded]).numpy()
         frame, shared = (torch.from_numpy(part) for part in equations.step(damping, low, high))
         change, offsets, _ = shared.tensor_split([len(beta), len(beta) + pose.offsets_m.numel()])
         moved = Articulation(pose.rig).apply_step(pose, frame)
-        return replace(moved, rig=self.reshape(beta + change), offsets_m=pose.offsets_m + offsets.reshape(-1, 3))
+        return replace(moved, rig=self.model.rig(beta + change), offsets_m=pose.offsets_m + offsets.reshape(-1, 3))
 
 
 def levenberg_marquardt(problem: Problem, pose: Pose, data_term: Callable[[Tensor], DataTerm], steps: int) -> Pose:

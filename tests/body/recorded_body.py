@@ -1,5 +1,6 @@
 """A naked body of known shape and pose, recorded without error: keypoints and masks from a ring of cameras."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.keypoint_fit import Problem
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
-from hnerf.body.rig import joint_transforms, rotation_from_axis_angle
+from hnerf.body.rig import Rig, joint_transforms, rotation_from_axis_angle
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
 from hnerf.config import FitSettings
@@ -78,6 +79,13 @@ def problem_at(pose: Pose, capture: Capture, acceleration_mps2: float, proportio
     settings, observations = FitSettings(), observe(capture)
     smoothness = Smoothness(runs(capture), capture.fps, np.full(25, acceleration_mps2))
     return make_problem(body_model(settings), pose, observations, smoothness, settings, 1, proportions)
+
+
+def of_linear_model(problem: Problem, rig: Rig) -> Problem:
+    """Return the problem with a model whose shapes are linear around a rig: anny's own reshaping takes half of a
+    step."""
+    model = replace(problem.model, rig=lambda beta: rig if beta is None else rig.reshaped(beta))
+    return replace(problem, model=model)
 
 
 def record(root: Path, body: BodyFit, cameras: dict[str, Camera], train: tuple[str, ...]) -> Capture:

@@ -7,7 +7,7 @@ import torch
 
 from hnerf.body import contour_fit
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.body_model import body_model
+from hnerf.body.body_model import BodyModel, body_model
 from hnerf.body.fit import (
     _outlines,
     _report,
@@ -18,14 +18,23 @@ from hnerf.body.fit import (
 )
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.ground import Ground
-from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
+from hnerf.body.keypoint_fit import Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
 from hnerf.capture.capture import Capture
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from tests.body import recorded_body
-from tests.body.recorded_body import joints_m, moving_body, problem_at, record, ring_camera, silhouettes, true_pose
+from tests.body.recorded_body import (
+    joints_m,
+    moving_body,
+    of_linear_model,
+    problem_at,
+    record,
+    ring_camera,
+    silhouettes,
+    true_pose,
+)
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 from tests.calibration.synthetic import edited_keypoints
@@ -152,8 +161,7 @@ def test_with_one_camera_the_soles_stand_on_the_ground(tmp_path: Path, monkeypat
 def test_an_arm_mirrored_in_depth_is_corrected_from_neighbouring_frames(tmp_path: Path) -> None:
     truth = moving_body((0, 1, 2))
     capture, pose = record(tmp_path, truth, RING, ("0",)), true_pose(truth)
-    problem = problem_at(pose, capture, 30.0, 0.1)
-    problem = replace(problem, reshape=pose.rig.reshaped)  # faster: anny's own reshaping takes half of a step
+    problem = of_linear_model(problem_at(pose, capture, 30.0, 0.1), pose.rig)
     pose = levenberg_marquardt(problem, pose, problem.image_term, 15)
     mirrored_theta = pose.theta.clone()
     mirrored_theta[1, truth.rig.joint_names.index("upperarm01.L")] += torch.tensor([0.0, 2.0, 0.0])
@@ -241,9 +249,10 @@ def test_the_normal_equations_contain_the_gradient_of_the_cost(tmp_path: Path) -
     rig, seen = two_bone_rig(), observe(capture)
 
     pose, one = random_pose(rig, 3), torch.ones(1, dtype=torch.float64)
-    likely = FitPriors(0.02, 0.5, 0.02, 2.0, 0.1, 0 * one, one, -9 * one, 9 * one)
+    model = BodyModel(lambda _: rig, 0 * one, one, -9 * one, 9 * one, one.bool(), torch.zeros(0), is_smpl=False)
+    settings = FitSettings(keypoint_m=0.02, keypoint_outlier_m=0.5, offset_m=0.02, stature_m=2.0, stature_std_m=0.1)
     rough = Smoothness([(0, 1, 2)], 25.0, np.full(25, 1e9))
-    problem = Problem(seen, metres_per_pixel(seen.cameras, pose), likely, rough, rig.reshaped)
+    problem = Problem(seen, metres_per_pixel(seen.cameras, pose), model, settings, rough)
     generator = torch.Generator().manual_seed(0)
     frame, shared = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in ((3, 9), (76,)))
     ends = []
