@@ -15,7 +15,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from hnerf.body.rig import Rig, joint_transforms, pose_vertices, posed_joint_basis, rotation_from_axis_angle
+from hnerf.body.rig import (
+    Rig,
+    cross_matrix,
+    joint_transforms,
+    pose_vertices,
+    posed_joint_basis,
+    rotation_from_axis_angle,
+)
 
 
 @dataclass(frozen=True)
@@ -249,7 +256,5 @@ def left_jacobian(axis_angle: Tensor) -> Tensor:
     angle = safe.sqrt()
     first = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
     second = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
-    x, y, z = axis_angle.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    cross = cross_matrix(axis_angle)
     return torch.eye(3, dtype=cross.dtype) + first * cross + second * (cross @ cross)

@@ -132,10 +132,15 @@ def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
     angle = safe.sqrt()
     sinc = torch.where(small, 1 - angle_squared / 6, angle.sin() / angle)
     half = torch.where(small, 0.5 - angle_squared / 24, (1 - angle.cos()) / safe)
-    x, y, z = axis_angle.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    cross = cross_matrix(axis_angle)
     return torch.eye(3, dtype=cross.dtype, device=cross.device) + sinc * cross + half * (cross @ cross)
+
+
+def cross_matrix(vectors: Tensor) -> Tensor:
+    """Return the matrices [v] (..., 3, 3) of vectors v (..., 3), for which [v] w is v x w."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
 def joint_transforms(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
-from hnerf.body.rig import Rig
+from hnerf.body.rig import Rig, cross_matrix
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.capture.safe_pickle import MAX_BYTES, read_pickle
 from hnerf.errors import InputError, raise_if_unreachable
@@ -140,8 +140,7 @@ def _shortest_rotation(a: Tensor, b: Tensor) -> Tensor:
     """Return the rotation (3, 3) of direction a into b, which is not opposite, about their common normal
     (Rodrigues)."""
     a, b = a / a.norm(), b / b.norm()
-    x, y, z = torch.linalg.cross(a, b).tolist()
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=a.dtype)
+    cross = cross_matrix(torch.linalg.cross(a, b))
     return torch.eye(3, dtype=a.dtype) + cross + cross @ cross / (1 + a @ b)
 
 
