@@ -12,7 +12,7 @@ from torch import Tensor
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.hand_points import OUTLIER_M, POINT_STD_M, SEEN, SIDES, finger_joints, hand_points, moved_onto_palm
 from hnerf.body.normal_equations import NormalEquations
-from hnerf.body.pose_prior import add_turn_prior
+from hnerf.body.pose_prior import add_turn_prior, turn_axes
 from hnerf.body.reprojection import Views, reprojection_term
 from hnerf.body.rig import Rig
 from hnerf.body.robust import geman_mcclure
@@ -58,11 +58,8 @@ class FingerPrior:
             for finger, chain_m in enumerate(fingers_m):
                 bones = [bone / bone.norm() for bone in chain_m.diff(dim=0, prepend=wrist_m[None])]
                 for above, bone in itertools.pairwise([*bones, bones[-1]]):
-                    axis = normal if finger == 0 else torch.linalg.cross(bone, palmwards)
-                    axis = axis - (axis @ bone) * bone
-                    axis = axis / axis.norm()
-                    axes.append(torch.stack([axis, bone, torch.linalg.cross(axis, bone)]))
-                    bends.append(torch.linalg.cross(above, bone) @ axis if finger > 0 else bone.new_zeros(()))
+                    axes.append(turn_axes(normal if finger == 0 else torch.linalg.cross(bone, palmwards), bone))
+                    bends.append(torch.linalg.cross(above, bone) @ axes[-1][0] if finger > 0 else bone.new_zeros(()))
         relaxed = torch.tensor([*THUMB_RELAXED_DEG, *4 * RELAXED_DEG] * 2, dtype=rig.joints_m.dtype)
         std = torch.tensor([*THUMB_STD_DEG, *4 * STD_DEG] * 2, dtype=relaxed.dtype)
         bend = torch.stack(bends).asin()

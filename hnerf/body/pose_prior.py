@@ -107,7 +107,12 @@ def _bone_directions(articulation: Articulation) -> Tensor:
 def _axes(above: Tensor, bone: Tensor, hinge: bool) -> Tensor:
     """Return the axes of a joint, rows flexion, twist, sideways. A hinge flexes in the plane of its two bones, other
     joints about the left-right axis."""
-    flexion = torch.linalg.cross(above, bone) if hinge else torch.tensor([1.0, 0, 0], dtype=bone.dtype)
+    return turn_axes(torch.linalg.cross(above, bone) if hinge else torch.tensor([1.0, 0, 0], dtype=bone.dtype), bone)
+
+
+def turn_axes(flexion: Tensor, bone: Tensor) -> Tensor:
+    """Return unit axes (3, 3) about which a joint turns, rows flexion, twist, sideways: flexion, of any length, is made
+    perpendicular to the unit direction of the bone."""
     flexion = flexion - (flexion @ bone) * bone
     flexion = flexion / flexion.norm()
     return torch.stack([flexion, bone, torch.linalg.cross(flexion, bone)])
