@@ -164,7 +164,7 @@ def _support(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> np.nda
 
 
 def person_heights_px(people: np.ndarray) -> np.ndarray:
-    """Return the larger side of each person's keypoint box, (P,)."""
+    """Return the larger side of the box around each person's keypoints, (...,) of (..., 25, 3)."""
     visible = people[..., 2:] > 0
     low = np.where(visible, people[..., :2], np.inf).min(-2)
     high = np.where(visible, people[..., :2], -np.inf).max(-2)

@@ -65,9 +65,8 @@ class HandNetwork:
         """Return the points (21, 3) of the hand in a region of an image (H, W, 3) uint8 RGB: x_px, y_px and the
         probability that there is a hand."""
         raw, presence = self._network(region.crop(image, SIZE) / 255)[:2]
-        from_crop = region.from_crop(SIZE)
-        places = raw.reshape(-1, 3)[:, :2].astype(np.float64) @ from_crop[:, :2].T + from_crop[:, 2]
-        return np.column_stack([places, np.full(POINTS, float(presence[0]))])
+        pixels = region.to_image(raw.reshape(-1, 3)[:, :2].astype(np.float64), SIZE)
+        return np.column_stack([pixels, np.full(POINTS, float(presence[0]))])
 
 
 class _NetworkOfThread(threading.local):
@@ -81,7 +80,7 @@ def find_hands(image: np.ndarray, keypoints: np.ndarray, network: HandNetwork) -
     """Return the left and the right hand, (2, 21, 3), of the person with BODY_25 keypoints (25, 3) in an image: x_px,
     y_px, confidence, which is 0 if the forearm is not seen or the points belong to something else."""
     hands = np.zeros((2, POINTS, 3))
-    sides_px, height_px = np.zeros(2), float(person_heights_px(keypoints[None])[0])
+    sides_px, height_px = np.zeros(2), float(person_heights_px(keypoints))
     for hand, (elbow, wrist) in enumerate(SIDES):
         if keypoints[[elbow, wrist], 2].min() <= 0:
             continue

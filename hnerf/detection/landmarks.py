@@ -37,9 +37,7 @@ class LandmarkNetwork:
         if presence[0] < MIN_PRESENCE:
             return None
         points = raw.reshape(-1, 5).astype(np.float64)
-        places = refine_by_heatmap(points[:, :2], sigmoid(heat))
-        from_crop = region.from_crop(SIZE)
-        pixels = places @ from_crop[:, :2].T + from_crop[:, 2]
+        pixels = region.to_image(refine_by_heatmap(points[:, :2], sigmoid(heat)), SIZE)
         confidence = sigmoid(points[:POINTS, 3]) * sigmoid(points[:POINTS, 4])  # visible, and in the image
         points_m = region.to_camera_axes(metric.reshape(-1, 3)[:POINTS].astype(np.float64))
         points_px = np.column_stack([pixels[:POINTS], confidence])

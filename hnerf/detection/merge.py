@@ -22,7 +22,7 @@ def fill_missing(own: np.ndarray, network: np.ndarray) -> np.ndarray:
 
 def nearest_person(person: np.ndarray, others: np.ndarray) -> int | None:
     """Return the index of the one of (Q, 25, 3) nearest to a person (25, 3); None if none is near enough."""
-    best, nearest = None, MATCH_SHARE * float(person_heights_px(person[None])[0])
+    best, nearest = None, MATCH_SHARE * float(person_heights_px(person))
     for i, other in enumerate(others):
         both = (person[:, 2] > 0) & (other[:, 2] > 0)
         if both.any():

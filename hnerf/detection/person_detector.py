@@ -64,6 +64,5 @@ class PersonDetector:
         raw, logits = self._network(shown.crop(image, SIZE) / 127.5 - 1)
         scores = sigmoid(logits[:, 0])
         sure = scores >= MIN_SCORE
-        from_crop = shown.from_crop(1)
         people = weighted_nms(decode_boxes(raw[sure], self._anchors[sure]), scores[sure])
-        return [region_around(*(person[2:4] @ from_crop[:, :2].T + from_crop[:, 2])) for person in people]
+        return [region_around(*shown.to_image(person[2:4], 1)) for person in people]

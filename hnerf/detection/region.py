@@ -27,24 +27,29 @@ class Region(NamedTuple):
         down = np.array([-right[1], right[0]])
         return np.column_stack([right, down, self.centre_px - (right + down) * size / 2])
 
+    def to_image(self, places: np.ndarray, size: int) -> np.ndarray:
+        """Return the pixels of the image for places (n, 2) in a crop of `size` x `size`."""
+        from_crop = self.from_crop(size)
+        return places @ from_crop[:, :2].T + from_crop[:, 2]
+
     def crop(self, image: np.ndarray, size: int) -> np.ndarray:
         """Resample the region of an image (H, W, 3) to (size, size, 3) uint8; black outside the image."""
-        to_image = self.from_crop(size)
-        to_image[:, 2] += to_image[:, :2].sum(1) / 2  # pixel centres at integers
+        from_crop = self.from_crop(size)
+        from_crop[:, 2] += from_crop[:, :2].sum(1) / 2  # pixel centres at integers
         if size < SHRINK_BELOW * self.side_px:
             full = np.array(image.shape[1::-1])
             small = np.maximum(1, np.round(full * size / self.side_px)).astype(int)
             image = cv2.resize(image, small.tolist(), interpolation=cv2.INTER_AREA)
             scale = small / full
-            to_image[:, 2] = (to_image[:, 2] + 0.5) * scale - 0.5
-            to_image[:, :2] *= scale[:, None]
-        return cv2.warpAffine(image, to_image, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+            from_crop[:, 2] = (from_crop[:, 2] + 0.5) * scale - 0.5
+            from_crop[:, :2] *= scale[:, None]
+        return cv2.warpAffine(image, from_crop, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
     def paste(self, crop: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
         """Resample a crop (size, size) into an image of (width, height) px, (H, W); 0 outside the region."""
-        to_image = self.from_crop(len(crop))
-        to_image[:, 2] += to_image[:, :2].sum(1) / 2
-        return cv2.warpAffine(crop, to_image, size_px, flags=cv2.INTER_LINEAR)
+        from_crop = self.from_crop(len(crop))
+        from_crop[:, 2] += from_crop[:, :2].sum(1) / 2
+        return cv2.warpAffine(crop, from_crop, size_px, flags=cv2.INTER_LINEAR)
 
     def to_camera_axes(self, directions: np.ndarray) -> np.ndarray:
         """Rotate vectors (..., 3), right, down and away in the region, into the axes of the camera."""
