@@ -21,7 +21,7 @@ from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.videos import Videos
 from hnerf.capture.formats.zjumocap import ZjuMocap
-from hnerf.capture.keypoint_files import pad_people, read_openpose, read_results
+from hnerf.capture.keypoint_files import pad_people, read_results
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import (
@@ -40,7 +40,6 @@ from hnerf.capture.safe_io import (
     file_named,
     path_in_capture,
     read_image,
-    read_mask,
     shown,
 )
 from hnerf.capture.subset import write_points
@@ -321,14 +320,13 @@ def _write_camera(
     return normaliser, area
 
 
-def _write_masks(normaliser: Normaliser, masks: dict[int, Path | StoredFrame], out: Path, soft: bool = False) -> None:
+def _write_masks(normaliser: Normaliser, masks: dict[int, StoredFrame], out: Path, soft: bool = False) -> None:
     """Write the masks of one camera, by frame. If one has soft edges, all of them are written again as soft."""
     for frame, mask in tracked(masks.items(), f"masks of camera {normaliser.lens.name}", len(masks)):
-        recorded = mask.read() if isinstance(mask, StoredFrame) else read_mask(mask)
-        path = mask.path if isinstance(mask, StoredFrame) else mask
-        if not soft and has_soft_edges(recorded, path):
+        recorded = mask.read()
+        if not soft and has_soft_edges(recorded, mask.path):
             return _write_masks(normaliser, masks, out, soft=True)
-        normaliser.write_mask(recorded, soft, path, out / f"{frame:06d}.png")
+        normaliser.write_mask(recorded, soft, mask.path, out / f"{frame:06d}.png")
 
 
 def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> None:
@@ -366,12 +364,11 @@ def lens_as_recorded(
 
 
 def _per_frame(
-    files: dict[int, Path | StoredFrame], wanted: tuple[int, ...], recorded: tuple[int, ...], what: str
-) -> dict[int, Path | StoredFrame]:
+    files: dict[int, StoredFrame], wanted: tuple[int, ...], recorded: tuple[int, ...], what: str
+) -> dict[int, StoredFrame]:
     """Return the files of the wanted frames, in their order. Raises InputError if there is not one for every recorded
     frame."""
-    some = next(iter(files.values()))
-    place = some.path if isinstance(some, StoredFrame) else some.parent
+    place = next(iter(files.values())).place
     if len(files) != len(recorded):
         nobody = " (an empty list of people where nobody is seen)" if what == "keypoints" else ""
         raise InputError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one for each{nobody}")
@@ -391,11 +388,10 @@ def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | No
     files = layout.keypoint_files(camera)
     results = file_named(layout.folder, camera, "keypoints", suffixes=JSON_SUFFIXES)
     if files:
-        chosen = _per_frame(files, recorded, recorded, "keypoints").values()
-        paths = [file.path if isinstance(file, StoredFrame) else file for file in chosen]
-        people = [file.read() if isinstance(file, StoredFrame) else read_openpose(file) for file in chosen]
+        chosen = list(_per_frame(files, recorded, recorded, "keypoints").values())
+        paths, people, place = [file.path for file in chosen], [file.read() for file in chosen], chosen[0].place
     elif results.is_file():
-        paths, people = [results] * len(recorded), read_results(results, recorded)
+        paths, people, place = [results] * len(recorded), read_results(results, recorded), results
     else:
         return None
     count = next((p.shape[1] for p in people if len(p)), 0)
@@ -403,7 +399,6 @@ def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | No
         if len(points) and points.shape[1] != count:
             raise InputError(f"{path}: {points.shape[1]} keypoints a person where others have {count}; detect again")
     stacked = pad_people([points.reshape(len(points), count, 3) for points in people])
-    place = paths[0] if len(set(paths)) == 1 else paths[0].parent
     _check_in_pixels(place, stacked[stacked[..., 2] > 0][:, :2], next(footage.read(recorded[:1])))
     return stacked
 

@@ -95,7 +95,7 @@ class Uncalibrated(Layout):
         """Return the footage opened so far, as a cache: opening a video decodes all of it."""
         return {}
 
-    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+    def keypoint_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return openpose/<camera>/, else pose/<camera>_json/."""
         return EasyMocap(self.folder).keypoint_files(camera)
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from hnerf.capture import safe_io
 from hnerf.capture.footage import Footage, ImageFolder, Video
-from hnerf.capture.formats.layout import Layout, StoredFrame
+from hnerf.capture.formats.layout import Layout, StoredFrame, one_a_file
+from hnerf.capture.keypoint_files import read_openpose
 from hnerf.capture.lens import Lens, by_name, checked_lens
 from hnerf.errors import InputError
 from hnerf.strict_yaml import parse_yaml_strings
@@ -44,26 +45,26 @@ class EasyMocap(Layout):
             )
         return Video.open(video)
 
-    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+    def keypoint_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return openpose/<camera>/<frame>_keypoints.json by frame, else Pose2Sim's pose/<camera>_json/*.json, one for
         each frame, in the order of the numbers in their names (walk_9 before walk_10)."""
         if own := safe_io.files_in(self.folder, "openpose", camera, suffixes=safe_io.JSON_SUFFIXES):
-            return dict(safe_io.numbered(own, "keypoints"))
+            return one_a_file(safe_io.numbered(own, "keypoints"), read_openpose)
         found = safe_io.files_in(self.folder, "pose", f"{camera}_json", suffixes=safe_io.JSON_SUFFIXES)
         images = sorted(self._images(camera))
         numbers = images if len(images) == len(found) else range(len(found))
-        return dict(zip(numbers, sorted(found, key=_natural_order), strict=True))
+        return one_a_file(dict(zip(numbers, sorted(found, key=_natural_order), strict=True)), read_openpose)
 
     def _images(self, camera: str) -> dict[int, Path]:
         files = safe_io.files_in(self.folder, "images", camera, suffixes=safe_io.IMAGE_SUFFIXES)
         return safe_io.numbered(files, "images")
 
-    def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+    def mask_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return masks/<camera>/<frame>.png, or mask/, by frame."""
         for name in ("masks", "mask"):
             files = safe_io.files_in(self.folder, name, camera, suffixes=safe_io.IMAGE_SUFFIXES)
             if files:
-                return dict(safe_io.numbered(files, "masks"))
+                return one_a_file(safe_io.numbered(files, "masks"), safe_io.read_mask)
         return {}
 
     def plate_file(self, camera: str) -> Path | None:

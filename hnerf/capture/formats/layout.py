@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -14,11 +15,18 @@ from hnerf.capture.lens import Lens
 
 
 class StoredFrame(NamedTuple):
-    """One frame of a file that holds a whole recording. path: for messages; read: returns a mask (H, W) uint8, or
-    keypoints (people, K, 3) as `read_openpose` does."""
+    """The mask or keypoints of one frame. path: the file that holds them; place: the same file if it holds all frames,
+    else its folder, for messages; read: returns a mask (H, W) uint8, or keypoints (people, K, 3) as `read_openpose`
+    does."""
 
     path: Path
+    place: Path
     read: Callable[[], np.ndarray]
+
+
+def one_a_file(files: dict[int, Path], read: Callable[[Path], np.ndarray]) -> dict[int, StoredFrame]:
+    """Return the frames of files that hold one each; `read` reads a file."""
+    return {frame: StoredFrame(path, path.parent, partial(read, path)) for frame, path in files.items()}
 
 
 @dataclass(frozen=True)
@@ -51,11 +59,11 @@ class Layout(ABC):
         means all."""
         return []
 
-    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return OpenPose JSON files, or stored frames, by frame; empty if nothing was detected for this camera."""
+    def keypoint_files(self, camera: str) -> dict[int, StoredFrame]:
+        """Return keypoints by frame; empty if nothing was detected for this camera."""
         return {}
 
-    def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+    def mask_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return given person masks by frame; empty if there are none."""
         return {}
 

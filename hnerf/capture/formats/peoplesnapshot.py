@@ -59,20 +59,20 @@ class PeopleSnapshot(Layout):
             raise InputError(f"{self.folder}: {len(videos)} videos .mp4; leave exactly one")
         return Video.open(videos[0])
 
-    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+    def keypoint_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return the frames of keypoints.hdf5: keypoints (N, 54), OpenPose's COCO model."""
         path = path_in_capture(self.folder, "keypoints.hdf5")
         if not path.exists():
             return {}
         count = self._one_a_frame(path, "keypoints")
         found = _array(path, "keypoints", (3 * COCO_POINTS,)).reshape(count, 1, COCO_POINTS, 3)
-        return {i: StoredFrame(path, points.copy) for i, points in enumerate(without_far_points(path, found))}
+        return {i: StoredFrame(path, path, points.copy) for i, points in enumerate(without_far_points(path, found))}
 
-    def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+    def mask_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return the frames of masks.hdf5: masks (N, H, W), 0 outside the person."""
         path = path_in_capture(self.folder, "masks.hdf5")
         count = self._one_a_frame(path, "masks") if path.exists() else 0
-        return {i: StoredFrame(path, partial(_mask, path, i)) for i in range(count)}
+        return {i: StoredFrame(path, path, partial(_mask, path, i)) for i in range(count)}
 
     def _one_a_frame(self, path: Path, name: str) -> int:
         """Return the number of frames. Raises InputError unless a dataset declares a row for each, before anything is

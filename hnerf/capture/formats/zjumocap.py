@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from hnerf.capture.footage import Footage, ImageFolder
-from hnerf.capture.formats.layout import Layout, StoredFrame
+from hnerf.capture.formats.layout import Layout, StoredFrame, one_a_file
 from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.lens import Lens, checked_lens
-from hnerf.capture.safe_io import path_in_capture, shown
+from hnerf.capture.safe_io import path_in_capture, read_mask, shown
 from hnerf.capture.safe_pickle import read_pickled_npy
 from hnerf.errors import InputError
 
@@ -90,14 +90,14 @@ class ZjuMocap(Layout):
         files = {frame: path_in_capture(self.folder, *path.parts) for frame, path in self.images[camera].items()}
         return ImageFolder(next(iter(files.values())).parent, files)
 
-    def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+    def mask_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return mask_cihp/<image>.png, or mask/, by frame: part labels, 0 outside the person. A camera may have
         none."""
         images = {frame: path.with_suffix(".png").parts for frame, path in self.images[camera].items()}
         for name in ("mask_cihp", "mask"):
             masks = {frame: path_in_capture(self.folder, name, *parts) for frame, parts in images.items()}
             if any(path.exists() for path in masks.values()):
-                return dict(masks)
+                return one_a_file(masks, read_mask)
         return {}
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:

@@ -9,7 +9,6 @@ import pytest
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats import peoplesnapshot
-from hnerf.capture.formats.layout import StoredFrame
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
@@ -65,7 +64,7 @@ def test_keypoints_are_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) 
     whole = peoplesnapshot._array
     monkeypatch.setattr(peoplesnapshot, "_array", lambda *what: read.append(what[1]) or whole(*what))
     frames = PeopleSnapshot(folder).keypoint_files("camera").values()
-    assert [frame.read().shape for frame in frames if isinstance(frame, StoredFrame)] == [(1, 18, 3)] * 6
+    assert [frame.read().shape for frame in frames] == [(1, 18, 3)] * 6
     assert read == ["keypoints"]
 
 

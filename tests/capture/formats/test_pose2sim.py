@@ -77,7 +77,7 @@ def test_keypoint_files_are_sorted_by_the_numbers_in_their_names(tmp_path: Path)
     for name in ("walk1_10", "walk1_9", "walk_\u0663", "\u0663"):
         (folder / f"{name}.json").touch()
     files = Pose2Sim(tmp_path).keypoint_files("a")
-    assert [Path(str(file)).stem for file in files.values()] == ["walk1_9", "walk1_10", "walk_\u0663", "\u0663"]
+    assert [file.path.stem for file in files.values()] == ["walk1_9", "walk1_10", "walk_\u0663", "\u0663"]
 
 
 def test_keypoint_files_are_matched_to_numbered_images(tmp_path: Path) -> None:
