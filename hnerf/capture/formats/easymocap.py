@@ -36,14 +36,13 @@ class EasyMocap(Layout):
             return ImageFolder(self.folder / "images" / camera, images)
         video = safe_io.file_named(self.folder, camera, "videos", suffixes=safe_io.VIDEO_SUFFIXES)
         beside = safe_io.file_named(self.folder, camera, suffixes=safe_io.VIDEO_SUFFIXES)
-        if not video.exists() and beside.exists():
-            return Video.open(beside)
-        if not video.exists():
-            raise InputError(
-                f"{self.folder / 'images' / camera}: no JPEG or PNG images, and no {video}; "
-                "add them, or leave the camera out of [cameras] in capture.toml"
-            )
-        return Video.open(video)
+        for found in (video, beside):
+            if found.exists():
+                return Video.open(found)
+        raise InputError(
+            f"{self.folder / 'images' / camera}: no JPEG or PNG images, and no {video}; "
+            "add them, or leave the camera out of [cameras] in capture.toml"
+        )
 
     def keypoint_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return openpose/<camera>/<frame>_keypoints.json by frame, else Pose2Sim's pose/<camera>_json/*.json, one for
