@@ -76,26 +76,26 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         reasons = size_reasons(capture, name) + intrinsics_reasons(old) + _fit_reasons(name, before, settings)
         reasons += [f"{mistakes[name]}: undone"] if name in mistakes else []
         reasons += [_timing_reason(offset, timing[name]), *_change_reasons(old, new), refinement.reasons[name]]
+        fault, why = _fault(name, after, settings.max_residual_px)
+        status = fault or ("refined" if new is not old or offset else "ok")
         residuals_px = after.median_px[name], after.p95_px[name], before.median_px[name], before.p95_px[name]
-        status = "refined" if new is not old or offset else "ok"
-        verdict = CameraVerdict(status, *residuals_px, offset, timing[name], tuple(reasons))
-        verdicts[name] = _judged(verdict, after.median_px[name], after.misfit == name, settings.max_residual_px)
+        verdicts[name] = CameraVerdict(status, *residuals_px, offset, timing[name], (*reasons, *why))
     if sum(v.status != "rejected" for v in verdicts.values()) < 2:
         raise InputError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
     held_out_px |= refinement.held_out_px
     notes += [*refinement.notes, *_height_notes(after.body_height_m, capture.stature_m)]
     return CalibrationReport(
-        every,
-        verdicts,
-        before,
-        after,
-        held_out_px,
-        refinement.outlines_px,
-        tuple(notes),
-        capture.up,
-        evidence,
-        doubts(synchronised, keypoints, after.points_m),
+        cameras=every,
+        verdicts=verdicts,
+        up=capture.up,
+        notes=tuple(notes),
+        doubts=doubts(synchronised, keypoints, after.points_m),
+        before=before,
+        after=after,
+        evidence=evidence,
+        held_out_px=held_out_px,
+        outlines_px=refinement.outlines_px,
     )
 
 
@@ -223,14 +223,15 @@ def _change_reasons(old: Camera, new: Camera) -> list[str]:
     return [f"turned by {turned_deg:.2f} degrees, moved by {moved_cm:.1f} cm{lens}"]
 
 
-def _judged(verdict: CameraVerdict, median_px: float, misfit: bool, limit_px: float) -> CameraVerdict:
-    """Return one training camera's verdict, downgraded if the residuals are still too large."""
-    if median_px > limit_px:
-        why = f"as used, median residual is still {median_px:.1f} px"
-        verdict = dataclasses.replace(verdict, status="suspect", reasons=(*verdict.reasons, why))
-    if misfit and median_px > REJECT_FACTOR * limit_px:
-        verdict = dataclasses.replace(verdict, status="rejected", reasons=(*verdict.reasons, "not used from here on"))
-    return verdict
+def _fault(name: str, after: Measure, limit_px: float) -> tuple[str, list[str]]:
+    """Return the status of a camera whose residuals are still too large, and why, in words; both empty if they are
+    not."""
+    if after.median_px[name] <= limit_px:
+        return "", []
+    why = f"as used, median residual is still {after.median_px[name]:.1f} px"
+    if after.misfit == name and after.median_px[name] > REJECT_FACTOR * limit_px:
+        return "rejected", [why, "not used from here on"]
+    return "suspect", [why]
 
 
 def _unchecked(capture: Capture) -> CalibrationReport:
@@ -238,7 +239,7 @@ def _unchecked(capture: Capture) -> CalibrationReport:
     the cameras."""
     notes = ("not checked: the recording has no keypoints; cameras are used as given, with the poses given for them",)
     verdicts = {name: CameraVerdict("ok", reasons=tuple(size_reasons(capture, name))) for name in capture.train_cameras}
-    return CalibrationReport(capture.cameras, verdicts, None, None, {}, {}, notes, capture.up, None)
+    return CalibrationReport(capture.cameras, verdicts, capture.up, notes)
 
 
 def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
@@ -257,5 +258,4 @@ def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
     timing = Timing.unknown("one camera")
     verdict = CameraVerdict("refined" if raised else "ok", timing=timing, reasons=tuple(reasons))
     cameras = capture.cameras | {name: camera}
-    found = doubts(capture, keypoints[None], None)
-    return CalibrationReport(cameras, {name: verdict}, None, None, {}, {}, notes, capture.up, None, found)
+    return CalibrationReport(cameras, {name: verdict}, capture.up, notes, doubts(capture, keypoints[None], None))

@@ -54,22 +54,22 @@ class CameraVerdict:
 class CalibrationReport:
     """Result of the calibration check.
 
-    cameras: those to use from here on, test cameras included; verdicts: of the training cameras; before, after,
+    cameras: those to use from here on, test cameras included; verdicts: of the training cameras; notes: about the whole
+    rig, and checks that could not be made; doubts: what in the recording contradicts the calibration; before, after,
     evidence: None with one training camera, or without keypoints; held_out_px, outlines_px: cost of each correction
-    that was tried, on held-out frames and by the person's outlines; notes: about the whole rig, and checks that could
-    not be made; doubts: what in the recording contradicts the calibration.
+    that was tried, on held-out frames and by the person's outlines.
     """
 
     cameras: dict[str, Camera]
     verdicts: dict[str, CameraVerdict]
-    before: Measure | None
-    after: Measure | None
-    held_out_px: dict[str, float]
-    outlines_px: dict[str, float]
-    notes: tuple[str, ...]
     up: str
-    evidence: Evidence | None
+    notes: tuple[str, ...]
     doubts: tuple[str, ...] = ()
+    before: Measure | None = None
+    after: Measure | None = None
+    evidence: Evidence | None = None
+    held_out_px: dict[str, float] = dataclasses.field(default_factory=dict)
+    outlines_px: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
