@@ -69,7 +69,7 @@ def _clothed_step(
     found = [*chain.from_iterable(side_by_side(match_frame, range(len(edges)), threads=threads))]
     cloth_offset_m = solve_cloth_offset(before_m, [rows for _, rows in found], faces)
     found = [(t, _with_more_cloth(rows, cloth_offset_m - before_m)) for t, rows in found]
-    _, equations = problem.assemble(pose, problem.image_term)
+    _, equations = problem.assemble(pose)
     for t, rows in found:
         add_residuals(equations, articulation, skin, t, replace(rows, weight=rows.weight / EDGE_STD_M**2))
     pose = problem.apply_step(pose, equations, DAMPING)

@@ -179,7 +179,7 @@ def _outline_step(
     faces, cameras = pose.rig.faces.numpy(), problem.observations.cameras
     articulation = Articulation(pose.rig)
     skin = articulation.skin(pose)
-    _, equations = problem.assemble(pose, problem.image_term)
+    _, equations = problem.assemble(pose)
 
     def match_frame(t: int) -> tuple[list[ContourResiduals], list[float]]:
         vertices_m = articulation.surface(skin, t).numpy()

@@ -90,7 +90,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 problem = make_problem(
                     model, pose, observations, smoothness, settings, offsets=TIGHT_STD, proportions=TIGHT_STD
                 )
-                pose = levenberg_marquardt(problem, pose, problem.space_term, KEYPOINT_STEPS)
+                pose = levenberg_marquardt(replace(problem, in_space=True), pose, KEYPOINT_STEPS)
         with timed("keypoints in images", seconds, log):
             problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=TIGHT_STD)
             problem = replace(problem, **terms)
@@ -123,10 +123,10 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
 def _fit_in_images(capture: Capture, problem: Problem, pose: Pose, palm: PalmTerm | None) -> tuple[Pose, PosturePrior]:
     """Return the pose fitted to keypoints in the images, then to the palms as well, if hand points are known; and the
     posture prior for the next stages. With one camera, also resolve what a single view leaves ambiguous."""
-    pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
+    pose = levenberg_marquardt(problem, pose, KEYPOINT_STEPS)
     if palm:
         problem = replace(problem, palm=palm)
-        pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
+        pose = levenberg_marquardt(problem, pose, KEYPOINT_STEPS)
     cameras = problem.observations.cameras
     if len(cameras) > 1:
         return pose, PosturePrior.of_twists(len(pose.root), Articulation(pose.rig))
@@ -169,12 +169,12 @@ def resolve_depth_flips(problem: Problem, pose: Pose, runs_of_frames: list[tuple
     A few frames in which the fit took the mirror image are outvoted by their neighbours (median filter), and the fit is
     repeated; the first result is kept if the cost does not fall. `runs_of_frames`: frames in order, by run.
     """
-    pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
+    pose = levenberg_marquardt(problem, pose, KEYPOINT_STEPS)
     parts = np.split(pose.theta.numpy(), np.cumsum([len(run) for run in runs_of_frames])[:-1])
     theta = np.concatenate([median_filter(part, (MEDIAN_FRAMES, 1, 1), mode="nearest") for part in parts])
     again = replace(pose, theta=torch.from_numpy(theta))
-    again = levenberg_marquardt(problem, again, problem.image_term, KEYPOINT_STEPS)
-    before, after = (problem.assemble(p, problem.image_term)[0] for p in (pose, again))
+    again = levenberg_marquardt(problem, again, KEYPOINT_STEPS)
+    before, after = (problem.assemble(p)[0] for p in (pose, again))
     return again if after < before else pose
 
 
@@ -190,8 +190,8 @@ def hold_single_posture(problem: Problem, pose: Pose, posture_prior: PosturePrio
     single = learned.as_single_posture()
     if single is None:
         return pose, learned
-    held = levenberg_marquardt(replace(problem, posture_prior=single), pose, problem.image_term, KEYPOINT_STEPS)
-    free_cost, held_cost = (problem.assemble(p, problem.image_term)[0] for p in (pose, held))
+    held = levenberg_marquardt(replace(problem, posture_prior=single), pose, KEYPOINT_STEPS)
+    free_cost, held_cost = (problem.assemble(p)[0] for p in (pose, held))
     log.info("one posture in all frames costs %.2f times what one pose per frame does", held_cost / free_cost)
     return (held, single) if held_cost < MAX_SINGLE_POSTURE_COST * free_cost else (pose, learned)
 

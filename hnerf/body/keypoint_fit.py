@@ -1,6 +1,5 @@
 """Fit of pose and shape to keypoints: in space where they triangulate, then in the images."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,8 +32,9 @@ class Problem:
 
     Shared unknowns: beta (B,), then the keypoint offsets (75,), then the median turns of the posture prior. scale_m (C,
     n): metres a pixel spans at the person, held fixed, since residuals would otherwise shrink as the body comes nearer.
-    balance, ground: used with one camera only; posture_prior: None as long as no posture is known; palm: None without
-    hand points; limb_depths: None unless the only camera has metric landmarks.
+    in_space: whether the body is fitted to triangulated keypoints, not to those in the images. balance, ground: used
+    with one camera only; posture_prior: None as long as no posture is known; palm: None without hand points;
+    limb_depths: None unless the only camera has metric landmarks.
     """
 
     observations: Observations
@@ -42,20 +42,21 @@ class Problem:
     model: BodyModel
     settings: FitSettings
     smoothness: Smoothness
+    in_space: bool = False
     balance: Balance | None = None
     ground: Ground | None = None
     posture_prior: PosturePrior | None = None
     palm: PalmTerm | None = None
     limb_depths: LimbDepths | None = None
 
-    def assemble(self, pose: Pose, data_term: Callable[[Tensor], DataTerm]) -> tuple[float, NormalEquations]:
-        """Return the cost and the normal equations of the keypoints, weighted by `data_term`, and of all priors."""
+    def assemble(self, pose: Pose) -> tuple[float, NormalEquations]:
+        """Return the cost and the normal equations of the keypoints and of all priors."""
         articulation = Articulation(pose.rig)
         points = with_offsets(articulation.keypoints(), pose.offsets_m)
         joints = articulation.pose(pose)
         x, by_frame, by_shape = articulation.jacobian(points, joints)
         by_shared = torch.cat([by_shape, _offset_jacobian(points, joints.rotations)], -1)
-        matrix, pull, cost = data_term(x)
+        matrix, pull, cost = self._space_term(x) if self.in_space else self._image_term(x)
         posture_unknowns = self.posture_prior.unknowns(articulation) if self.posture_prior else 0
         equations = NormalEquations(len(x), articulation.unknowns, by_shared.shape[-1] + posture_unknowns)
         equations.frame[0][:, ROOT, ROOT] += ROOT_INFORMATION
@@ -93,8 +94,8 @@ class Problem:
         equations.shared_gradient[shape] += excess * by_beta
         return 0.5 * float((precision * values**2).sum()) + 0.5 * excess**2
 
-    def space_term(self, x: Tensor) -> DataTerm:
-        """Return the data term of triangulated keypoints; robust as in `image_term`."""
+    def _space_term(self, x: Tensor) -> DataTerm:
+        """Return the data term of triangulated keypoints; robust as in `_image_term`."""
         known = self.observations.space_m.isfinite().all(-1)
         residual = torch.where(known[..., None], x - self.observations.space_m.nan_to_num(), 0.0)
         squared, trust, eye = residual.square().sum(-1), known.to(x.dtype), torch.eye(3, dtype=x.dtype)
@@ -102,7 +103,7 @@ class Problem:
         weight = trust * weight
         return weight[..., None, None] * eye, weight[..., None] * residual, float((trust * cost).sum())
 
-    def image_term(self, x: Tensor) -> DataTerm:
+    def _image_term(self, x: Tensor) -> DataTerm:
         """Return the data term of reprojected keypoints, with pixel residuals converted to metres."""
         return reprojection_term(
             self.observations, self.scale_m, x, self.settings.keypoint_m, self.settings.keypoint_outlier_m
@@ -120,13 +121,13 @@ class Problem:
         return replace(moved, rig=self.model.rig(beta + change), offsets_m=pose.offsets_m + offsets.reshape(-1, 3))
 
 
-def levenberg_marquardt(problem: Problem, pose: Pose, data_term: Callable[[Tensor], DataTerm], steps: int) -> Pose:
+def levenberg_marquardt(problem: Problem, pose: Pose, steps: int) -> Pose:
     """Minimise until a nearly undamped step lowers the cost by less than about a thousandth (Marquardt 1963)."""
     damping = 1e-2
-    cost, equations = problem.assemble(pose, data_term)
+    cost, equations = problem.assemble(pose)
     for _ in range(steps):
         trial = problem.apply_step(pose, equations, damping)
-        trial_cost, trial_equations = problem.assemble(trial, data_term)
+        trial_cost, trial_equations = problem.assemble(trial)
         if trial_cost >= cost:
             damping *= 5
             continue

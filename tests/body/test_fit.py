@@ -162,10 +162,10 @@ def test_an_arm_mirrored_in_depth_is_corrected_from_neighbouring_frames(tmp_path
     truth = moving_body((0, 1, 2))
     capture, pose = record(tmp_path, truth, RING, ("0",)), true_pose(truth)
     problem = of_linear_model(problem_at(pose, capture, 30.0, 0.1), pose.rig)
-    pose = levenberg_marquardt(problem, pose, problem.image_term, 15)
+    pose = levenberg_marquardt(problem, pose, 15)
     mirrored_theta = pose.theta.clone()
     mirrored_theta[1, truth.rig.joint_names.index("upperarm01.L")] += torch.tensor([0.0, 2.0, 0.0])
-    mirrored = levenberg_marquardt(problem, replace(pose, theta=mirrored_theta), problem.image_term, 15)
+    mirrored = levenberg_marquardt(problem, replace(pose, theta=mirrored_theta), 15)
     wrist = truth.rig.joint_names.index("wrist.L")
 
     def off_m(found: Pose) -> float:
@@ -260,10 +260,10 @@ def test_the_normal_equations_contain_the_gradient_of_the_cost(tmp_path: Path) -
         end = Articulation(rig).apply_step(pose, step * frame)
         offsets_m = pose.offsets_m + step * shared[1:].reshape(25, 3)
         ends.append(replace(end, rig=rig.reshaped(rig.beta + step * shared[:1]), offsets_m=offsets_m))
-    for data_term in (problem.space_term, problem.image_term):
-        _, equations = problem.assemble(pose, data_term)
+    for fitted in (problem, replace(problem, in_space=True)):
+        _, equations = fitted.assemble(pose)
         slope = float((equations.frame_gradient * frame.numpy()).sum() + equations.shared_gradient @ shared.numpy())
-        above, below = (problem.assemble(end, data_term)[0] for end in ends)
+        above, below = (fitted.assemble(end)[0] for end in ends)
         np.testing.assert_allclose(
             slope, (above - below) / 2e-6, rtol=5e-3
         )  # the prior's axes, which turn with the shape, are held fixed

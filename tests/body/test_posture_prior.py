@@ -176,7 +176,7 @@ def test_a_single_posture_is_enforced_only_if_the_frames_agree(sway_deg: float, 
     problem, begin = turning_person(tmp_path, sway_deg)
     problem = replace(problem, balance=Balance(up=2))
     posture_prior = PosturePrior.of_single_view([list(range(8))], begin, problem.observations.cameras[0])
-    first = levenberg_marquardt(replace(problem, posture_prior=posture_prior), begin, problem.image_term, 30)
+    first = levenberg_marquardt(replace(problem, posture_prior=posture_prior), begin, 30)
     pose, kept = hold_single_posture(problem, first, posture_prior)
     arms = pose.theta[:, [begin.rig.joint_names.index(bone) for bone in ARMS]]
     std_rad = (arms - arms.mean(0)).norm(dim=-1).mean()
@@ -209,9 +209,7 @@ def test_priors_reduce_lean_and_sway_of_a_person_turning_before_one_camera(tmp_p
         return torch.einsum("k,nkc->nc", centre_of_mass_over_feet(), x)[:, :2]
 
     def lean_and_sway(balance: Balance | None, posture_prior: PosturePrior | None) -> tuple[float, float]:
-        pose = levenberg_marquardt(
-            replace(problem, balance=balance, posture_prior=posture_prior), begin, problem.image_term, 30
-        )
+        pose = levenberg_marquardt(replace(problem, balance=balance, posture_prior=posture_prior), begin, 30)
         turns = pose.theta[:, arms]
         lean_m = (over_feet(pose) - over_feet(begin)).norm(dim=-1).mean()
         return float(lean_m), float((turns - turns.mean(0)).norm(dim=-1).mean())
