@@ -42,11 +42,11 @@ def check_spread(capture: Capture, keypoints: np.ndarray) -> None:
 def doubts(capture: Capture, keypoints: np.ndarray, points_m: np.ndarray | None) -> tuple[str, ...]:
     """Return in words what contradicts the recording, and log it. keypoints (C, frames, 25, 3) of the training cameras;
     points_m (frames, 25, 3), None with one camera."""
-    found = of_other_pictures(capture, keypoints)
+    found = doubts_about_pictures(capture, keypoints)
     if points_m is not None:
         crossed_m = crossed_points([capture.cameras[name] for name in capture.train_cameras], keypoints, points_m)
         found = [*_not_upright(crossed_m, capture.up), *exchanged_sides(crossed_m), *found]
-        found += of_test_cameras(capture, points_m)
+        found += doubts_about_test_cameras(capture, points_m)
     for line in found:
         log.warning("%s: %s", capture.name, line)
     return tuple(found)
@@ -96,7 +96,7 @@ def _direction(start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
     return (end_m - start_m) / np.linalg.norm(end_m - start_m, axis=-1, keepdims=True).clip(1e-9)
 
 
-def of_test_cameras(capture: Capture, points_m: np.ndarray) -> list[str]:
+def doubts_about_test_cameras(capture: Capture, points_m: np.ndarray) -> list[str]:
     """Return doubts about test cameras that do not see the person where the training cameras do, at points_m (frames,
     25, 3): all scores would be wrong. If a test camera has no keypoints, its images must show some of these points."""
     lines = []
@@ -140,7 +140,7 @@ def _in_sight(camera: Camera, points_m: np.ndarray) -> bool:
     return float(np.ptp(uv[inside], axis=0).max()) >= MIN_PERSON_PX
 
 
-def of_other_pictures(capture: Capture, keypoints: np.ndarray) -> list[str]:
+def doubts_about_pictures(capture: Capture, keypoints: np.ndarray) -> list[str]:
     """Return doubts if keypoints (C, frames, 25, 3) lie on the person only when they are mirrored left to right, or if
     a camera's keypoints were detected in images other than its own.
 

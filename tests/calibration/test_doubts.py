@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hnerf.calibration.doubts import doubts, exchanged_sides, of_other_pictures, of_test_cameras
+from hnerf.calibration.doubts import doubts, doubts_about_pictures, doubts_about_test_cameras, exchanged_sides
 from hnerf.capture.capture import Capture, write_image
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import FRAMES, SIZE_PX, detections, edited_keypoints, ring, walk_m, write_capture
@@ -67,10 +67,10 @@ def with_masks(root: Path) -> tuple[Capture, np.ndarray]:
 
 def test_masks_reveal_keypoints_of_mirrored_images(tmp_path: Path) -> None:
     capture, keypoints = with_masks(tmp_path)
-    assert of_other_pictures(capture, keypoints) == []
+    assert doubts_about_pictures(capture, keypoints) == []
     wrong = keypoints.copy()
     wrong[..., 0] = SIZE_PX - 1 - wrong[..., 0]
-    (doubt,) = of_other_pictures(capture, wrong)
+    (doubt,) = doubts_about_pictures(capture, wrong)
     assert "mirrored left to right 100%" in doubt
 
 
@@ -82,22 +82,22 @@ def test_inverted_masks_are_not_taken_for_mirrored_images(tmp_path: Path) -> Non
         inverted = np.full((SIZE_PX, SIZE_PX), 255, np.uint8)
         inverted[:, : SIZE_PX // 4] = 0
         write_image(path, inverted)
-    assert of_other_pictures(capture, keypoints) == []
+    assert doubts_about_pictures(capture, keypoints) == []
 
 
 def test_masks_reveal_keypoints_that_do_not_belong_to_the_images_of_one_camera(tmp_path: Path) -> None:
     capture, keypoints = with_masks(tmp_path)
     first, mirrored = capture.train_cameras[0], keypoints.copy()
     mirrored[0, ..., 0] = SIZE_PX - 1 - mirrored[0, ..., 0]
-    (doubt,) = of_other_pictures(capture, mirrored)
+    (doubt,) = doubts_about_pictures(capture, mirrored)
     assert doubt.startswith(f"camera {first}: ") and "mirrored 100%" in doubt
-    first_line, _ = of_other_pictures(capture, keypoints[[1, 0, 2]])
+    first_line, _ = doubts_about_pictures(capture, keypoints[[1, 0, 2]])
     assert f"those of camera {capture.train_cameras[1]} 100%" in first_line
-    (doubt,) = of_other_pictures(capture, np.concatenate([keypoints[:1, ::-1], keypoints[1:]]))
+    (doubt,) = doubts_about_pictures(capture, np.concatenate([keypoints[:1, ::-1], keypoints[1:]]))
     assert doubt.startswith(f"camera {first}: ") and "in reverse order" in doubt
     elsewhere = keypoints.copy()
     elsewhere[0, ..., :2] = 3
-    (doubt,) = of_other_pictures(capture, elsewhere)
+    (doubt,) = doubts_about_pictures(capture, elsewhere)
     assert doubt.startswith(f"camera {first}: 0% ") and "in other cameras 100%" in doubt
 
 
@@ -108,12 +108,12 @@ def test_masks_that_are_loose_or_show_half_the_person_raise_no_doubt(tmp_path: P
         mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
         mask[:middle_px] = 255
         write_image(tmp_path / "masks" / capture.train_cameras[0] / f"{frame:06d}.png", mask)
-    assert of_other_pictures(capture, keypoints) == []
+    assert doubts_about_pictures(capture, keypoints) == []
 
 
 def test_without_masks_or_plates_there_is_no_doubt(tmp_path: Path) -> None:
     capture = write_capture(tmp_path, ring(3), detections(ring(3), 1))
-    assert of_other_pictures(capture, detections(ring(3), 1)) == []
+    assert doubts_about_pictures(capture, detections(ring(3), 1)) == []
 
 
 def with_a_test_camera(root: Path, wrong: Camera, detected: bool) -> Capture:
@@ -148,7 +148,7 @@ def test_a_test_camera_may_also_see_somebody_else_or_nobody(tmp_path: Path) -> N
     with edited_keypoints(tmp_path) as found:
         found["c3"] = np.concatenate([found["c3"] + [300, 0, 0], found["c3"]], 1)
         found["c3"][1] = 0
-    assert of_test_cameras(capture, points_m) == []
+    assert doubts_about_test_cameras(capture, points_m) == []
     with edited_keypoints(tmp_path) as found:
         found["c3"][:] = 0
-    assert of_test_cameras(capture, points_m) == []
+    assert doubts_about_test_cameras(capture, points_m) == []
