@@ -37,34 +37,34 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     for name, prior_of in tracked(priors, "segmentation", len(capture.train_cameras)):
         backend = choose_backend(capture, name, prior_of, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
-        looks = list(side_by_side(partial(_look, capture, backend, prior_of), range(len(capture.frames))))
-        cameras[name] = {"backend": backend.name} | _findings(capture, name, looks)
-        encoded |= {(name, frame): look.encoded for frame, look in zip(capture.frames, looks, strict=True)}
+        masks = list(side_by_side(partial(_judged_mask, capture, backend, prior_of), range(len(capture.frames))))
+        cameras[name] = {"backend": backend.name} | _findings(capture, name, masks)
+        encoded |= {(name, frame): mask.encoded for frame, mask in zip(capture.frames, masks, strict=True)}
         for row in cameras[name]["dropped"]:
             del encoded[name, row["frame"]]
     return Masks(encoded, {"cameras": cameras})
 
 
-class _Look(NamedTuple):
-    """Result for one image: the encoded mask, its verdict, and the number of pixels of the prior's body."""
+class _JudgedMask(NamedTuple):
+    """The mask of one image, encoded, with its verdict and the number of pixels of the prior's body."""
 
     encoded: bytes
     verdict: MaskVerdict
     body_px: int
 
 
-def _look(capture: Capture, backend: Backend, prior_of: PriorOf, number: int) -> _Look:
+def _judged_mask(capture: Capture, backend: Backend, prior_of: PriorOf, number: int) -> _JudgedMask:
     prior = prior_of(number)
     mask = backend.mask(capture.frames[number], prior)
-    return _Look(encode(mask), judge_mask(mask, prior), int(prior.body.sum()))
+    return _JudgedMask(encode(mask), judge_mask(mask, prior), int(prior.body.sum()))
 
 
-def _findings(capture: Capture, camera: str, looks: list[_Look]) -> dict[str, Any]:
+def _findings(capture: Capture, camera: str, masks: list[_JudgedMask]) -> dict[str, Any]:
     """Return plain values: the median area, and the frames that are dropped or noted, each with its reason."""
-    sudden = area_jumps(capture.frames, [look.verdict for look in looks], [look.body_px for look in looks])
+    sudden = area_jumps(capture.frames, [mask.verdict for mask in masks], [mask.body_px for mask in masks])
     judged = {
-        frame: dataclasses.replace(look.verdict, fault=look.verdict.fault or sudden.get(frame))
-        for frame, look in zip(capture.frames, looks, strict=True)
+        frame: dataclasses.replace(mask.verdict, fault=mask.verdict.fault or sudden.get(frame))
+        for frame, mask in zip(capture.frames, masks, strict=True)
     }
     dropped = [{"frame": frame, "reason": v.fault} for frame, v in judged.items() if v.fault]
     if len(dropped) == len(judged):
