@@ -102,7 +102,7 @@ def render_person(person: Renderable, camera: Camera) -> tuple[np.ndarray, np.nd
     low = np.floor(seen_px.min(0) - 1).astype(int).clip(0, camera.size_px)
     high = np.ceil(seen_px.max(0) + 2).astype(int).clip(0, camera.size_px)
     window = np.s_[low[1] : high[1], low[0] : high[0]]
-    pixels = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1)
+    pixels = camera.pixels_px[window]
     for offset in subpixel_offsets_px():
         _, directions = camera.rays(pixels + offset)
         hits = person.cast(camera.centre_m, directions.reshape(-1, 3))
