@@ -6,9 +6,8 @@ SMPL-X (joint names of its package), and CMU's motion capture database as it is 
 """
 
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
-SKELETONS = ("ue5", "mixamo", "humanik", "vrm", "smplx", "cmu")
 ROOT, PELVIS = "root", "pelvis"
 
 # Names of the body models' joints (hnerf/body/anny.py, hnerf/body/smpl.py), without side, where exports rename them.
@@ -32,8 +31,7 @@ _SERIAL = re.compile(
 )
 
 
-@dataclass(frozen=True)
-class Names:
+class Names(NamedTuple):
     """One joint's names in other skeletons; empty where a skeleton has no such joint."""
 
     ue5: str = ""
@@ -42,6 +40,9 @@ class Names:
     vrm: str = ""
     smplx: str = ""
     cmu: str = ""
+
+
+SKELETONS = Names._fields
 
 
 def exported_name(joint: str) -> str:
@@ -90,7 +91,7 @@ def _sided() -> dict[str, Names]:
 
 def _of_side(names: Names, side: str) -> Names:
     words = {"Side": side, "side": side.lower(), "s": side[0].lower()}
-    return Names(*(getattr(names, skeleton).format(**words) for skeleton in SKELETONS))
+    return Names(*(name.format(**words) for name in names))
 
 
 # By exported name.
