@@ -31,9 +31,9 @@ STEP = 1e-6  # finite difference of a phenotype, for its derivative
 
 # Limbs, spine, neck and head turn; fingers, toes, eyes and the twist halves of a limb follow their parents.
 FREE_JOINTS = (
-    "root", "spine05", "spine03", "spine01", "neck01", "head", "clavicle.L", "clavicle.R", "upperarm01.L",
-    "upperarm01.R", "lowerarm01.L", "lowerarm01.R", "wrist.L", "wrist.R", "upperleg01.L", "upperleg01.R",
-    "lowerleg01.L", "lowerleg01.R", "foot.L", "foot.R",
+    "spine05", "spine03", "spine01", "neck01", "head", "clavicle.L", "clavicle.R", "upperarm01.L", "upperarm01.R",
+    "lowerarm01.L", "lowerarm01.R", "wrist.L", "wrist.R", "upperleg01.L", "upperleg01.R", "lowerleg01.L",
+    "lowerleg01.R", "foot.L", "foot.R",
 )  # fmt: skip
 
 # BODY_25 in OpenPose's order, by the names of anny's keypoint regressor; pairs are averaged.
@@ -102,7 +102,7 @@ def _average() -> Rig:
         joint_basis=torch.zeros(len(BETA_NAMES), *model.template_bone_heads.shape),
         skin_joints=model.vertex_bone_indices.long(),
         skin_weights=model.vertex_bone_weights / model.vertex_bone_weights.sum(1, keepdim=True),
-        free=torch.tensor([name in FREE_JOINTS and name != "root" for name in joint_names]),
+        free=torch.tensor([name in FREE_JOINTS for name in joint_names]),
         keypoint_weights=_keypoint_weights(model),
     ).to(dtype=torch.float32)
 
