@@ -90,7 +90,7 @@ class PalmTerm:
         points = hand_points(articulation)
         palm = Points(points.weights[PALM_ROWS], points.rest_m[PALM_ROWS], points.basis_m[PALM_ROWS])
         x, by_frame, by_shape = articulation.jacobian(palm, joints)
-        matrix, pull, cost = reprojection_term(self.views.of(PALM_ROWS), scale_m, x, PALM_STD_M, OUTLIER_M)
+        matrix, pull, cost = reprojection_term(self.views.select(PALM_ROWS), scale_m, x, PALM_STD_M, OUTLIER_M)
         equations.add_points(matrix, pull, by_frame, by_shape)
         return cost
 

@@ -21,7 +21,7 @@ class Views:
     pixels: Tensor
     confidence: Tensor
 
-    def of(self, points: list[int]) -> "Views":
+    def select(self, points: list[int]) -> "Views":
         """Return the views of some of the points."""
         return Views(self.cameras, self.pixels[..., points, :], self.confidence[..., points])
 

@@ -47,7 +47,7 @@ def follow_outlines(
         return list(cameras), ""
     log.info("trying: fitted to outlines")
     person_m = np.nanmedian(points_m.reshape(-1, 3), 0)
-    fitted, judged = outlines.some(slice(0, None, 2)), outlines.some(slice(1, None, 2))
+    fitted, judged = outlines.select(slice(0, None, 2)), outlines.select(slice(1, None, 2))
     followed = adjust_to_outlines(fitted, cameras, free, person_m, unknown_focal)
     before_px, after_px = judged.cost_px(cameras), judged.cost_px(followed)
     if after_px >= min((1 - min_improvement) * before_px, before_px - MIN_GAIN_PX):

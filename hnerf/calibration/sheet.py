@@ -28,7 +28,7 @@ def draw_evidence(path: Path, evidence: Evidence, cameras: Sequence[Camera], fou
     middle = len(outlines.instants) // 2 if outlines else 0
     instant = outlines.instants[middle] if outlines else len(capture.frames) // 2
     every_px = outlines.residuals_px(cameras) if outlines else {}
-    shown_px = outlines.some(slice(middle, middle + 1)).residuals_px(cameras) if outlines else {}
+    shown_px = outlines.select(slice(middle, middle + 1)).residuals_px(cameras) if outlines else {}
     figure = Figure(figsize=(3 * PANEL_INCHES + 1, PANEL_INCHES * len(cameras) + 0.6), layout="constrained")
     panels = figure.subplots(len(cameras), 3, squeeze=False)
     for row, camera, detected in zip(panels, cameras, evidence.keypoints[:, instant], strict=True):

@@ -8,7 +8,6 @@ point of the ray lies outside, in pixels of the camera that excludes it. It does
 import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -100,7 +99,7 @@ class Outlines:
         usable = {name: outlines for name, outlines in by_camera.items() if any(outlines)}
         return Outlines(usable, tuple(shown)) if len(usable) > 1 else None
 
-    def some(self, positions: slice) -> "Outlines":
+    def select(self, positions: slice) -> "Outlines":
         """Return the outlines of some instants, by their positions in `instants`."""
         return Outlines({name: row[positions] for name, row in self.by_camera.items()}, self.instants[positions])
 
@@ -155,8 +154,8 @@ class NearHull:
             return np.zeros((len(replacements), 0))
         before_px = np.concatenate([near.closest_px() for near in near_hull])
         close = before_px > -SLIGHT_CHANGE_PX
-        starts = np.cumsum([0, *(len(near.along_m) for near in near_hull)])
-        searched = [near.only(close[start:end]) for near, (start, end) in zip(near_hull, pairwise(starts), strict=True)]
+        parts = np.split(close, np.cumsum([len(near.along_m) for near in near_hull])[:-1])
+        searched = [near.select(part) for near, part in zip(near_hull, parts, strict=True)]
         changed_px = np.zeros((len(replacements), len(close)))
         for i, replaced in enumerate(replacements):
             after_px = np.concatenate([near.replaced(replaced).closest_px() for near in searched])
@@ -221,7 +220,7 @@ class _RaysNearHull:
         outside_px = {**self.outside_px, **{name: _outside_px(*of, self.points_m) for name, of in changed.items()}}
         return dataclasses.replace(self, seen=seen, outside_px=outside_px)
 
-    def only(self, rays: np.ndarray) -> "_RaysNearHull":
+    def select(self, rays: np.ndarray) -> "_RaysNearHull":
         """Return the samples of some of the rays, (n,) bool."""
         camera, outline = self.seen[self.name]
         seen = {**self.seen, self.name: (camera, dataclasses.replace(outline, points_px=outline.points_px[rays]))}

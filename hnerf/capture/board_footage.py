@@ -127,7 +127,7 @@ class BoardCorners:
     frame_step: int
     frames: tuple[int, ...]
 
-    def of(self, cameras: Sequence[str]) -> "BoardCorners":
+    def select(self, cameras: Sequence[str]) -> "BoardCorners":
         """Return the corners that these cameras saw."""
         rows = [self.cameras.index(name) for name in cameras]
         return dataclasses.replace(self, cameras=tuple(cameras), corners_px=self.corners_px[rows])

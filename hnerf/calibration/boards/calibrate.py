@@ -102,12 +102,12 @@ def board_evidence(capture: Capture) -> dict[str, Any] | None:
     stored = load_board_corners(capture.root)
     if stored is None:
         return None
-    corners = rig.planar_corners(stored.of([name for name in stored.cameras if name in capture.cameras]))
+    corners = rig.planar_corners(stored.select([name for name in stored.cameras if name in capture.cameras]))
     names = rig.largest_linked_group(corners)
     if len(names) < 2:
         return {"frames": len(corners.frames), "cameras": {}, "pairs": {}, "unlinked_cameras": [*corners.cameras]}
     cameras = [capture.cameras[name] for name in names]
-    own, given = (solve(cameras, corners.of(names)) for solve in (rig.solve_rig, rig.solve_boards))
+    own, given = (solve(cameras, corners.select(names)) for solve in (rig.solve_rig, rig.solve_boards))
     figures = {
         camera.name: _figures(given, i) | {"footage_rms_px": rms(own.error_px(i))} for i, camera in enumerate(cameras)
     }
