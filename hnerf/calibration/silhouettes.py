@@ -20,7 +20,7 @@ from hnerf.config import SegmentationSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
-from hnerf.segmentation.backends import AROUND_DETECTED, BackgroundSubtraction
+from hnerf.segmentation.backends import background_subtraction
 from hnerf.segmentation.prior import keypoint_priors
 from hnerf.side_by_side import side_by_side
 
@@ -280,5 +280,5 @@ def _masks(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[i
         return [mask for mask in given if mask is not None]
     settings = SegmentationSettings()
     prior_of = keypoint_priors(capture, name, keypoints, settings)
-    backend = BackgroundSubtraction.of(capture, name, prior_of, PLATE_FRAMES, AROUND_DETECTED, settings)
-    return [backend.mask(capture.frames[i], prior_of(i)) for i in shown]
+    mask_of = background_subtraction(capture, name, prior_of, PLATE_FRAMES, settings)
+    return [mask_of(capture.frames[i], prior_of(i)) for i in shown]

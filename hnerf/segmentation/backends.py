@@ -1,7 +1,8 @@
-"""Four sources of masks behind one interface: given, learned, difference from a clean plate or from a median over
-time."""
+"""Four sources of masks: given, learned, difference from a clean plate or from a median over time."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,87 +15,17 @@ from hnerf.segmentation.difference import difference, exposure_corrected, masked
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, PriorOf, bounding_window
 
-CLEAN_PLATE = "clean plate"
-AROUND_BODY, AROUND_DETECTED = "median around the fitted body", "median around the detected person"
 MEDIAN_FRAMES = 60  # evenly spaced frames at most, to estimate the background without a plate
 
-
-@dataclass(frozen=True)
-class Given:
-    """Masks that came with the recording; other people in them are removed."""
-
-    capture: Capture
-    camera: str
-    name: str = "given"
-
-    def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Return the given mask, reduced to the subject if the prior finds it there; empty if the subject is known to
-        be outside the image. Raises InputError if it is missing."""
-        mask = self.capture.given_mask(self.camera, frame)
-        if mask is None:
-            raise InputError(
-                f"masks/{self.camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none"
-            )
-        subject = components_within(mask, prior.reach)
-        inverted = prior.core.any() and not (subject & prior.core).any() and mask.mean() > 0.5  # and shows only a gap
-        return subject if (subject.any() and not inverted) or prior.elsewhere else mask
+MaskOf = Callable[[int, Prior], np.ndarray]
+"""Makes one camera's mask (H, W) bool of a frame, given the frame's prior."""
 
 
-@dataclass(frozen=True)
-class Learned:
-    """The probability map of a network, reduced to the subject."""
+class Backend(NamedTuple):
+    """A source of masks for one camera. name: for the report."""
 
-    capture: Capture
-    camera: str
-    network: Network
-    name: str = "learned model"
-
-    def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Return where the probability of a person is at least one half, within reach of the prior."""
-        likely = self.network.probability(self.capture.image(self.camera, frame)) >= 0.5
-        return components_within(likely & prior.reach, prior.reach)
-
-
-@dataclass(frozen=True)
-class BackgroundSubtraction:
-    """Difference from a plate, (H, W, 3) uint8 RGB, where it is `known`, (H, W) bool; then GrabCut."""
-
-    capture: Capture
-    camera: str
-    plate: np.ndarray = field(repr=False)
-    known: np.ndarray = field(repr=False)
-    settings: SegmentationSettings
     name: str
-
-    @staticmethod
-    def of(
-        capture: Capture, camera: str, prior_of: PriorOf, count: int, around: str, settings: SegmentationSettings
-    ) -> "BackgroundSubtraction":
-        """Use the clean plate, which is known everywhere, if there is one, else the median over at most `count` frames
-        of the pixels that their priors leave free."""
-        plate = capture.background(camera)
-        if plate is not None:
-            return BackgroundSubtraction(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
-        chosen = evenly_spaced(range(len(capture.frames)), count)
-        images = [capture.image(camera, capture.frames[i]) for i in chosen]
-        plate, known = masked_median(images, [prior_of(i).near for i in chosen])
-        return BackgroundSubtraction(capture, camera, plate, known, settings, around)
-
-    def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Return the mask, found in the window within reach of the prior."""
-        image, window = self.capture.image(self.camera, frame), bounding_window(prior.reach)
-        mask = np.zeros(image.shape[:2], bool)
-        if not prior.reach.any():
-            return mask
-        free = visible_background(prior, self.known)
-        plate = exposure_corrected(self.plate, image, free)
-        noise, is_median = noise_level(image, plate, free), self.name != CLEAN_PLATE
-        found = difference(image[window], plate[window], noise, self.settings, shadowed=is_median)
-        mask[window] = cut(image[window], found, prior.cropped(window), self.known[window])
-        return mask
-
-
-Backend = Given | Learned | BackgroundSubtraction  # a source of masks for one camera; `name` is for the report
+    mask_of: MaskOf
 
 
 def choose_backend(
@@ -107,12 +38,62 @@ def choose_backend(
     Raises InputError if none is possible.
     """
     if any(capture.given_mask(camera, frame) is not None for frame in capture.frames):
-        return Given(capture, camera)
+        return Backend("given", partial(given_mask, capture, camera))
     if network is not None:
-        return Learned(capture, camera, network)
-    if not fitted and not capture.has_person_masks and capture.background(camera) is None:
+        return Backend("learned model", partial(_learned_mask, capture, camera, network))
+    name = "median around the fitted body" if fitted else "median around the detected person"
+    if capture.background(camera) is not None:
+        name = "clean plate"
+    elif not fitted and not capture.has_person_masks:
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
-    around = AROUND_BODY if fitted else AROUND_DETECTED
-    return BackgroundSubtraction.of(capture, camera, prior_of, MEDIAN_FRAMES, around, settings)
+    return Backend(name, background_subtraction(capture, camera, prior_of, MEDIAN_FRAMES, settings))
+
+
+def given_mask(capture: Capture, camera: str, frame: int, prior: Prior) -> np.ndarray:
+    """Return the mask that came with the recording, reduced to the subject if the prior finds it there; empty if the
+    subject is known to be outside the image. Raises InputError if it is missing."""
+    mask = capture.given_mask(camera, frame)
+    if mask is None:
+        raise InputError(f"masks/{camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none")
+    subject = components_within(mask, prior.reach)
+    inverted = prior.core.any() and not (subject & prior.core).any() and mask.mean() > 0.5  # and shows only a gap
+    return subject if (subject.any() and not inverted) or prior.elsewhere else mask
+
+
+def _learned_mask(capture: Capture, camera: str, network: Network, frame: int, prior: Prior) -> np.ndarray:
+    """Return where the network's probability of a person is at least one half, within reach of the prior."""
+    likely = network.probability(capture.image(camera, frame)) >= 0.5
+    return components_within(likely & prior.reach, prior.reach)
+
+
+def background_subtraction(
+    capture: Capture, camera: str, prior_of: PriorOf, count: int, settings: SegmentationSettings
+) -> MaskOf:
+    """Return masks from the difference to the clean plate, which is known everywhere, if there is one, else to the
+    median over at most `count` frames of the pixels that their priors leave free."""
+    plate = capture.background(camera)
+    if plate is not None:
+        return partial(_subtracted, capture, camera, plate, np.ones(plate.shape[:2], bool), False, settings)
+    chosen = evenly_spaced(range(len(capture.frames)), count)
+    images = [capture.image(camera, capture.frames[i]) for i in chosen]
+    plate, known = masked_median(images, [prior_of(i).near for i in chosen])
+    return partial(_subtracted, capture, camera, plate, known, True, settings)
+
+
+def _subtracted(
+    capture: Capture, camera: str, plate: np.ndarray, known: np.ndarray, is_median: bool,
+    settings: SegmentationSettings, frame: int, prior: Prior,
+) -> np.ndarray:  # fmt: skip
+    """Return the mask found by GrabCut in the window within reach of the prior. plate (H, W, 3) uint8 RGB, where it is
+    `known`, (H, W) bool."""
+    image, window = capture.image(camera, frame), bounding_window(prior.reach)
+    mask = np.zeros(image.shape[:2], bool)
+    if not prior.reach.any():
+        return mask
+    free = visible_background(prior, known)
+    plate = exposure_corrected(plate, image, free)
+    found = difference(image[window], plate[window], noise_level(image, plate, free), settings, shadowed=is_median)
+    mask[window] = cut(image[window], found, prior.cropped(window), known[window])
+    return mask

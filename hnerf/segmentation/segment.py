@@ -55,7 +55,7 @@ class _JudgedMask(NamedTuple):
 
 def _judged_mask(capture: Capture, backend: Backend, prior_of: PriorOf, number: int) -> _JudgedMask:
     prior = prior_of(number)
-    mask = backend.mask(capture.frames[number], prior)
+    mask = backend.mask_of(capture.frames[number], prior)
     return _JudgedMask(encode(mask), judge_mask(mask, prior), int(prior.body.sum()))
 
 

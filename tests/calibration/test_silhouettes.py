@@ -3,7 +3,6 @@
 import dataclasses
 from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -161,8 +160,7 @@ def test_outlines_show_the_subject_that_the_recording_names(tmp_path: Path, monk
     """The person is named in one camera and found in the others, too."""
     capture, each = recorded(tmp_path, ring(3), staying((0, -0.6)), staying((0, 0.6)))
     x, y, _ = each[1]["c1"][7, 0]
-    backend = SimpleNamespace(mask=lambda frame, prior: prior.body)
-    monkeypatch.setattr(silhouettes.BackgroundSubtraction, "of", lambda *_: backend)
+    monkeypatch.setattr(silhouettes, "background_subtraction", lambda *_: lambda frame, prior: prior.body)
     found = Outlines.of(dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c1", 7)))
     assert found is not None and found.by_camera.keys() == {"c0", "c1", "c2"}
     for name, (outline, *_) in found.by_camera.items():

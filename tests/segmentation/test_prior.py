@@ -5,7 +5,7 @@ import pytest
 
 from hnerf.capture.capture import write_image
 from hnerf.config import SegmentationSettings
-from hnerf.segmentation.backends import Given
+from hnerf.segmentation.backends import given_mask
 from hnerf.segmentation.prior import (
     _completed_pose,
     _consistent_keypoints,
@@ -89,7 +89,7 @@ def test_a_camera_that_looks_away_from_the_person_sees_nobody(tmp_path: Path) ->
     stranger[300:900, 400:600] = 255
     write_image(tmp_path / "masks" / "c2" / "000000.png", stranger)
     prior = dict(camera_priors(capture, None, SegmentationSettings()))["c2"](0)
-    assert prior.elsewhere and not Given(capture, "c2").mask(0, prior).any()
+    assert prior.elsewhere and not given_mask(capture, "c2", 0, prior).any()
 
 
 def test_unseen_head_and_legs_are_put_in_line_with_the_trunk_by_hand() -> None:

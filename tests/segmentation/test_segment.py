@@ -13,7 +13,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode, movement_px
 from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
-from hnerf.segmentation.backends import Given
+from hnerf.segmentation.backends import given_mask
 from hnerf.segmentation.cut import components_within
 from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, visible_background
 from hnerf.segmentation.edge import refine_edge
@@ -179,7 +179,7 @@ def test_a_given_mask_of_somebody_else_is_not_used(tmp_path: Path) -> None:
     write_masks(capture, truth)
     nowhere = np.zeros_like(truth["c0", 0])
     for height_px, believed in ((400.0, False), (0.0, True)):
-        mask = Given(capture, "c0").mask(0, Prior(nowhere, nowhere, nowhere, nowhere, height_px))
+        mask = given_mask(capture, "c0", 0, Prior(nowhere, nowhere, nowhere, nowhere, height_px))
         assert mask.any() == believed
 
 
@@ -195,7 +195,7 @@ def test_a_given_mask_loses_a_bystander_but_is_not_reduced_to_a_gap_beside_the_s
     inverted[12, 9] = True
     write_masks(capture, truth | {("c0", 0): feet | bystander, ("c0", 1): inverted})
     for frame, expected in enumerate((feet, inverted)):
-        mask = Given(capture, "c0").mask(frame, Prior(core, core, reach, reach, height_px=24.0))
+        mask = given_mask(capture, "c0", frame, Prior(core, core, reach, reach, height_px=24.0))
         np.testing.assert_array_equal(mask, expected)
 
 
