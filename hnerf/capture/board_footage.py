@@ -235,11 +235,11 @@ def _corners(
     row = {frame: i for i, frame in enumerate(frames)}
     wanted = {own: row[number] for number, own in zip(numbers, pictures.frames, strict=True) if number in row}
     for picture in pictures.read(wanted):
-        shape_px = picture.rgb.shape[1], picture.rgb.shape[0]
-        size_px = size_px or shape_px
-        if size_px != shape_px:
+        size_px = size_px or picture.size_px
+        if picture.size_px != size_px:
+            width_px, height_px = picture.size_px
             raise InputError(
-                f"{picture.file}: is {shape_px[0]} x {shape_px[1]} px, unlike the pictures before; use one size"
+                f"{picture.file}: is {width_px} x {height_px} px, unlike the pictures before; use one size"
             )
         corners_px[wanted[picture.frame]] = detector.corners_px(picture.rgb)
     if size_px is None:

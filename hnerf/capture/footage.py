@@ -34,6 +34,11 @@ class VideoFrame(NamedTuple):
     rgb: np.ndarray
     file: Path | None
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Return the image's (width, height)."""
+        return self.rgb.shape[1], self.rgb.shape[0]
+
 
 @dataclass(frozen=True)
 class ImageFolder:

@@ -154,8 +154,7 @@ def _first_size(layout: Layout, camera: str) -> tuple[int, int] | None:
     """Return the (width, height) of a camera's first image; None if there is none."""
     with suppress(InputError):
         footage = layout.footage(camera)
-        height_px, width_px = next(footage.read(footage.frames[:1])).rgb.shape[:2]
-        return width_px, height_px
+        return next(footage.read(footage.frames[:1])).size_px
     return None
 
 
@@ -347,11 +346,11 @@ def lens_as_recorded(
     Without such a proof the lens is unchanged. Raises InputError if the sizes then differ too much.
     """
     first = next(footage.read(frames[:1]))
-    recorded_px = (first.rgb.shape[1], first.rgb.shape[0])
+    recorded_px = first.size_px
     if lens.size_px in (None, recorded_px):
         return lens, None, recorded_px
     chosen = set(evenly_spaced(frames, BAR_FRAMES))
-    area = picture_area([p.rgb for p in footage.read(chosen) if p.rgb.shape == first.rgb.shape])
+    area = picture_area([p.rgb for p in footage.read(chosen) if p.size_px == recorded_px])
     matched_lens = lens_for_area(lens, area, recorded_px)
     if matched_lens:
         return matched_lens, area, recorded_px
@@ -406,7 +405,7 @@ def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | No
 def _check_in_pixels(place: Path, points: np.ndarray, picture: VideoFrame) -> None:
     """Raise InputError if most of a camera's keypoints (n, 2) cannot be in pixels of its images: they are outside, or
     in the first pixel, as coordinates from 0 to 1 would be."""
-    size_px = np.array(picture.rgb.shape[1::-1])
+    size_px = np.array(picture.size_px)
     if not len(points):
         return
     misplaced = ((points < 0) | (points > size_px)).any(-1) | (points <= 1).all(-1)

@@ -104,7 +104,7 @@ def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLe
     """Return a lens without distortion, at the origin, whose field of view across the longer side is the given one,
     else that in the metadata of the first image or the video, else the usual one."""
     first = next(footage.read(footage.frames[:1]))
-    height_px, width_px = first.rgb.shape[:2]
+    width_px, height_px = first.size_px
     longer_px = max(width_px, height_px)
     equivalent_mm = focal_35mm(first.file or footage.path)
     focal_px, source = USUAL_FOCAL * longer_px, ""
