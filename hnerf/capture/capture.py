@@ -234,7 +234,7 @@ def _camera(source: Path, name: str, described: dict[str, Any]) -> Camera:
     """Return the camera that a file describes. Raises ValueError, InputError or others if the description is
     invalid."""
     K, R, t_m = (np.array(described[key]) for key in ("K", "R", "t_m"))
-    lens = checked_lens((source, source), name, K, np.zeros(4), R, t_m, None)
+    lens = checked_lens(source, name, K, np.zeros(4), R, t_m, None)
     return Camera(name, lens.K, lens.R, lens.t_m, *check_image_size(source, *described["size_px"]))
 
 

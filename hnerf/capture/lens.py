@@ -86,7 +86,7 @@ def by_name(lenses: Iterable[Lens], source: Path) -> dict[str, Lens]:
 
 
 def checked_lens(
-    sources: tuple[Path, Path],
+    source: Path,
     name: object,
     K: np.ndarray,
     distortion: np.ndarray,
@@ -94,35 +94,36 @@ def checked_lens(
     t_m: np.ndarray,
     size_px: tuple[float, float] | None,
     estimated: bool = False,
+    extrinsics: Path | None = None,
 ) -> Lens:
     """Return a Lens from numbers of any shape. Raises InputError naming file and camera if they do not describe a
     camera.
 
-    sources: the files of the intrinsics and of the extrinsics. R: a matrix or a rotation vector (Rodrigues).
+    source: the file; extrinsics: that of R and t_m, if they are in another one. R: a matrix or a rotation vector
+    (Rodrigues).
     """
-    intrinsics, extrinsics = sources
-    camera = check_camera_name(name, intrinsics)
-    for source, label, value, sizes in (
-        (intrinsics, "K", K, (9,)),
-        (intrinsics, "distortion", distortion, (4, 5)),
+    camera, extrinsics = check_camera_name(name, source), extrinsics or source
+    for file, label, value, sizes in (
+        (source, "K", K, (9,)),
+        (source, "distortion", distortion, (4, 5)),
         (extrinsics, "R", R, (3, 9)),
         (extrinsics, "T", t_m, (3,)),
     ):
         if value.size not in sizes:
-            raise InputError(f"{source}: camera {camera}: {label} has {value.size} numbers; calibrate again")
+            raise InputError(f"{file}: camera {camera}: {label} has {value.size} numbers; calibrate again")
         if not np.isfinite(value).all():
-            raise InputError(f"{source}: camera {camera}: {label} holds a NaN or infinity; calibrate again")
+            raise InputError(f"{file}: camera {camera}: {label} holds a NaN or infinity; calibrate again")
         if np.abs(value).max() > MAX_NUMBER:
-            raise InputError(f"{source}: camera {camera}: {label} holds {np.abs(value).max():.3g}; calibrate again")
+            raise InputError(f"{file}: camera {camera}: {label} holds {np.abs(value).max():.3g}; calibrate again")
     K, R = K.reshape(3, 3), cv2.Rodrigues(R.ravel())[0] if R.size == 3 else R.reshape(3, 3)
     if K[0, 0] < MIN_FOCAL_PX or K[1, 1] < MIN_FOCAL_PX or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
-        raise InputError(f"{intrinsics}: camera {camera}: K is not a matrix of intrinsics in pixels; calibrate again")
+        raise InputError(f"{source}: camera {camera}: K is not a matrix of intrinsics in pixels; calibrate again")
     if abs(K[0, 1]) > MAX_SKEW_PX and np.any(distortion):
         raise InputError(
-            f"{intrinsics}: camera {camera}: has both skew and lens distortion, which cannot be undistorted together; "
+            f"{source}: camera {camera}: has both skew and lens distortion, which cannot be undistorted together; "
             "calibrate again without skew"
         )
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError(f"{extrinsics}: camera {camera}: R is not a rotation; calibrate again")
-    size = check_image_size(intrinsics, *size_px) if size_px else None
+    size = check_image_size(source, *size_px) if size_px else None
     return Lens(camera, K, distortion.ravel(), R, t_m.ravel(), size, estimated)

@@ -92,7 +92,7 @@ def _json_lenses(path: Path) -> list[Lens]:
     try:
         return [
             checked_lens(
-                sources=(path, path),
+                source=path,
                 name=str(k),
                 K=np.array(entry["K"], np.float64),
                 distortion=np.zeros(4),

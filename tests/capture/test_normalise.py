@@ -25,9 +25,8 @@ def test_kept_share_by_hand() -> None:
 @pytest.mark.parametrize(("skew", "k1", "refused"), [(12.0, -0.1, True), (1e-9, -0.1, False), (12.0, 0.0, False)])
 def test_skew_is_accepted_only_without_distortion(skew: float, k1: float, refused: bool) -> None:
     K, distortion = np.array([[800.0, skew, 499.5], [0, 800, 499.5], [0, 0, 1]]), np.array([k1, 0, 0, 0])
-    source = Path("intri.yml")
     with pytest.raises(InputError, match=r"intri\.yml: camera a: has both skew") if refused else nullcontext():
-        checked_lens((source, source), "a", K, distortion, np.eye(3), np.zeros(3), None)
+        checked_lens(Path("intri.yml"), "a", K, distortion, np.eye(3), np.zeros(3), None)
 
 
 def test_a_decomposed_folder_name_is_composed() -> None:

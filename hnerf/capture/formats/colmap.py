@@ -125,13 +125,14 @@ def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
     if not 0.5 < norm < 2:
         raise InputError(f"{sources[1]}: image {shot.name[:80]}: its quaternion is not of length 1; reconstruct")
     return checked_lens(
-        sources=sources,
+        source=sources[0],
         name=check_camera_name(PurePosixPath(shot.name.split("/")[0]).stem, sources[1]),
         K=np.array([[fx, 0, cx - PIXEL_CENTRE], [0, fy, cy - PIXEL_CENTRE], [0, 0, 1]]),
         distortion=values[4:9],
         R=Rotation.from_quat(quaternion / norm, scalar_first=True).as_matrix(),
         t_m=np.array(shot.pose[4:]),
         size_px=optics.size_px,
+        extrinsics=sources[1],
     )
 
 

@@ -184,7 +184,7 @@ def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None, ro
     if sides.count(None) == 1:
         raise InputError(f"{intri.path}: has one of W_{name} and H_{name}; add the other, or remove this one")
     return checked_lens(
-        sources=(intri.path, extri.path if extri else intri.path),
+        source=intri.path,
         name=name,
         K=intri.required(f"K_{name}"),
         distortion=np.zeros(4) if distortion is None else distortion,
@@ -192,4 +192,5 @@ def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None, ro
         t_m=extri.required(f"T_{name}") if extri else np.zeros(3),
         size_px=(width_px, height_px) if width_px is not None and height_px is not None else None,
         estimated=intri.number(f"estimated_{name}") == 1,
+        extrinsics=extri.path if extri else None,
     )

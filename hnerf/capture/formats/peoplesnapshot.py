@@ -46,7 +46,7 @@ class PeopleSnapshot(Layout):
             size_px = float(stored["width"]), float(stored["height"])
         except (IndexError, KeyError, OverflowError, TypeError, ValueError, cv2.error):
             raise InputError(f"{path}: camera_f, _c, _k, _rt, _t, width or height is missing; get it again") from None
-        return {CAMERA: checked_lens((path, path), CAMERA, K, distortion, R, shift, size_px)}
+        return {CAMERA: checked_lens(path, CAMERA, K, distortion, R, shift, size_px)}
 
     def footage(self, camera: str) -> Footage:
         """Return the one video, which is named after the subject."""

@@ -53,7 +53,7 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
             raise InputError(f"{source}: camera {key[:80]}: fisheye lenses are not supported; undistort its video")
         width_px, height_px = table["size"]
         return checked_lens(
-            sources=(source, source),
+            source=source,
             name=table["name"],
             K=np.array(table["matrix"], dtype=np.float64),
             distortion=np.array(table["distortions"], dtype=np.float64),

@@ -76,7 +76,7 @@ class ZjuMocap(Layout):
                 raise InputError(
                     f"{self.source}: camera {name[:80]}: K, D, R or T is missing; prepare it again"
                 ) from None
-            lens = checked_lens((self.source, self.source), name, K, D, R, T * METRES_PER_UNIT, None)
+            lens = checked_lens(self.source, name, K, D, R, T * METRES_PER_UNIT, None)
             lenses[lens.name] = lens
         return lenses
 
