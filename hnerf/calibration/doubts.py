@@ -77,7 +77,7 @@ def exchanged_sides(points_m: np.ndarray) -> list[str]:
     """
     forward = _direction(points_m[:, EARS].mean(1), points_m[:, NOSE])
     feet = _direction(points_m[:, HEELS].mean(1), points_m[:, TOES].mean(1))
-    forward = np.where(np.isnan(forward), 0, forward) + np.where(np.isnan(feet), 0, feet)
+    forward = np.nan_to_num(forward) + np.nan_to_num(feet)
     up = _direction(points_m[:, MID_HIP], points_m[:, NECK])
     left = np.cross(up, forward)
     labelled = _direction(points_m[:, RIGHT].mean(1), points_m[:, LEFT].mean(1))
