@@ -277,6 +277,11 @@ def _decoded(path: Path, mode: int) -> np.ndarray | None:
     return cv2.imdecode(content, mode) if len(content) else None
 
 
+def to_8_bit(values: np.ndarray) -> np.ndarray:
+    """Convert values in [0, 1] to uint8; values beyond are clipped."""
+    return (255 * values).round().clip(0, 255).astype(np.uint8)
+
+
 def write_image(path: Path, pixels: np.ndarray) -> None:
     """Write an image, grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), in the format of the file's suffix; create its
     folder if needed. JPEG is written without chroma subsampling. Raises OSError if the file cannot be written."""

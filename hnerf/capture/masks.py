@@ -49,7 +49,7 @@ class Masks:
 
 def encode(mask: np.ndarray) -> bytes:
     """Encode a mask (H, W) bool as PNG bytes of 0/255."""
-    return cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()
+    return cv2.imencode(".png", 255 * mask.astype(np.uint8))[1].tobytes()
 
 
 def movement_px(before: Masks, after: Masks) -> float:

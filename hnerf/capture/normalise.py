@@ -82,8 +82,8 @@ class Normaliser:
         """
         self._check_size(recorded, source)
         black = 127 if soft else 0
-        person = self.pixels(np.where(recorded > black, 255, 0).astype(np.uint8)) > 127
-        write_image(target, np.where(person, 255, 0).astype(np.uint8))
+        person = self.pixels(255 * (recorded > black).astype(np.uint8)) > 127
+        write_image(target, 255 * person.astype(np.uint8))
 
     def _check_size(self, pixels: np.ndarray, source: Path) -> None:
         """Raise InputError unless pixels have the recorded size."""

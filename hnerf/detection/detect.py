@@ -15,7 +15,7 @@ from zipfile import BadZipFile, ZipFile
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import KEYPOINTS, LANDMARKS, PERSON, Capture, write_image
+from hnerf.capture.capture import KEYPOINTS, LANDMARKS, PERSON, Capture, to_8_bit, write_image
 from hnerf.capture.keypoint_files import pad_people
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.subject import ranked_people
@@ -131,7 +131,7 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> float
     everybody = []
     for frame, people in zip(capture.frames, track(images, PersonDetector(), LandmarkNetwork(size)), strict=True):
         write_image(out / PERSON / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))
-        everybody.append([person._replace(mask=_eight_bit(person.mask)) for person in people])
+        everybody.append([person._replace(mask=to_8_bit(person.mask)) for person in people])
     path = out / LANDMARKS / f"{camera}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".partial")
@@ -164,11 +164,7 @@ def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarra
     likely = np.zeros(size_px[::-1], np.float32)
     for person in people:
         likely = np.maximum(likely, person.region.paste(person.mask, size_px))
-    return _eight_bit(likely)
-
-
-def _eight_bit(likely: np.ndarray) -> np.ndarray:
-    return (255 * likely).round().astype(np.uint8)
+    return to_8_bit(likely)
 
 
 def _is_whole(path: Path) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from hnerf.body.anny import anny_rig
 from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
-from hnerf.capture.capture import write_image
+from hnerf.capture.capture import to_8_bit, write_image
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.keypoint_files import write_openpose
 from hnerf.capture.lens import pinhole
@@ -76,7 +76,7 @@ def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
     test_cameras = camera_names(settings)[1]
     views = {camera.name: RoomView.of(camera) for camera in ring_of_cameras(settings)}
     for name, view in views.items():
-        write_image(out / "background" / f"{name}.jpg", _eight_bit(view.plate))
+        write_image(out / "background" / f"{name}.jpg", to_8_bit(view.plate))
     write_easymocap(out, [pinhole(view.camera) for view in views.values()])
     _write_toml(out, settings)
 
@@ -158,12 +158,10 @@ def _write_view(
     on_black, coverage, mask = render_person(truth.person, camera)
     photograph = on_black + (1 - coverage[..., None]) * view.shadowed(truth.shadow, truth.ground_m)
     noise = rng.normal(0, SENSOR_NOISE / 255, photograph.shape)
-    write_image(out / "images" / camera.name / f"{frame:06d}.jpg", _eight_bit(photograph + noise))
-    write_image(
-        out / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", np.where(mask, 255, 0).astype(np.uint8)
-    )
+    write_image(out / "images" / camera.name / f"{frame:06d}.jpg", to_8_bit(photograph + noise))
+    write_image(out / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", 255 * mask.astype(np.uint8))
     if scored:
-        write_image(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", _eight_bit(on_black))
+        write_image(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", to_8_bit(on_black))
     detected = detect(truth.keypoints_m, camera, truth.person.mesh, rng)
     write_openpose(out / "openpose" / camera.name / f"{frame:06d}_keypoints.json", detected.round(3))
 
@@ -203,8 +201,3 @@ def _write_truth(out: Path, faces: np.ndarray, surfaces_m: list[np.ndarray], joi
         names=np.array([*BODY_25_NAMES, *(f"rig:{name}" for name in MIXAMO.values())]),
         positions=np.stack(joints_m).astype(np.float32),
     )
-
-
-def _eight_bit(rgb: np.ndarray) -> np.ndarray:
-    """Convert colours in [0, 1] to uint8."""
-    return (rgb * 255).round().clip(0, 255).astype(np.uint8)
