@@ -47,11 +47,11 @@ class PosePrior:
         rig = articulation.rig
         names = [rig.joint_names[int(j)].split(".")[0] for j in articulation.joints[1:]]
         bones = _bone_directions(articulation)
-        self.axes = torch.stack([_axes(bones[int(articulation.parents[m + 1])], bones[m + 1], name in HINGES)
-                                 for m, name in enumerate(names)])  # fmt: skip
+        pairs = list(zip(bones[articulation.parents[1:]], bones[1:], strict=True))  # of each joint: bone above, own
+        self.axes = torch.stack([_axes(*pair, name in HINGES) for pair, name in zip(pairs, names, strict=True)])
         std = torch.tensor([STD_DEG.get(name, OTHER_STD_DEG) for name in names], dtype=bones.dtype)
         self.sigma = torch.deg2rad(std)
-        bend = torch.stack([_angle(bones[int(articulation.parents[m + 1])], bones[m + 1]) for m in range(len(names))])
+        bend = torch.stack([_angle(*pair) for pair in pairs])
         hinge = torch.tensor([name in HINGES for name in names])
         span = torch.deg2rad(torch.tensor([FLEXION_DEG.get(name, (-180, 180)) for name in names], dtype=bones.dtype))
         low = torch.where(hinge, -bend, span[:, 0])
