@@ -38,10 +38,9 @@ def initial_pose_from_given(given: GivenPoses, model: BodyModel, frames: Sequenc
     for j, name in enumerate(JOINTS):
         if name in LOCKED:
             continue
-        own = rig.joint_names.index(name)
-        above, below = (model.rest_rotations[rig.joint_names.index(JOINTS[PARENTS[j]])], model.rest_rotations[own])
+        own, parent = (rig.joint_names.index(joint) for joint in (name, JOINTS[PARENTS[j]]))
         turn = BODY_FROM_SMPL @ turns[:, j] @ BODY_FROM_SMPL.T
-        theta[:, own] = axis_angle_from_rotation(above @ turn @ below.T)
+        theta[:, own] = axis_angle_from_rotation(model.rest_rotations[parent] @ turn @ model.rest_rotations[own].T)
     return Pose(rig, theta, _root(rig, turns[:, 0], placed, model.is_smpl), torch.zeros(25, 3, dtype=torch.float64))
 
 
