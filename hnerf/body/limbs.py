@@ -24,8 +24,7 @@ NEAR_M = 10.0  # cdist sums products of coordinates: 100 m from the origin, it i
 class Limbs:
     """The parts of a body. vertex_limb (V,): 0 for trunk and head, or 1 + the index of the limb's first joint;
     face_limb (F,); on_cut (V,) bool: vertices where two limbs join; samples (P,): vertices that represent others;
-    sample_of (V,): the sample of each vertex; rest_m (P, L): distance of a sample at rest from each limb. The last
-    three are empty if there is only a trunk."""
+    sample_of (V,): the sample of each vertex; rest_m (P, L): distance of a sample at rest from each limb."""
 
     vertex_limb: Tensor
     face_limb: Tensor
@@ -47,8 +46,6 @@ class Limbs:
         face_limb = corner_limbs.amax(1)
         on_cut = torch.zeros(len(vertex_limb), dtype=torch.bool, device=face_limb.device)
         on_cut[rig.faces[corner_limbs.amin(1) < face_limb].flatten()] = True
-        if not face_limb.any():  # nothing to divide, and no distances to compute
-            return Limbs(vertex_limb, face_limb, on_cut, vertex_limb[:0], vertex_limb[:0], rig.vertices_m[:0])
         cell = torch.cat([(rig.vertices_m / SAMPLE_CELL_M).floor().long(), vertex_limb[:, None]], 1)
         cells, sample_of = torch.unique(cell, dim=0, return_inverse=True)
         vertices = torch.arange(len(cell), device=cell.device)
@@ -59,9 +56,6 @@ class Limbs:
     def close(self, vertices_m: Tensor) -> Tensor:
         """Return which vertices of posed bodies (n, V, 3) come close to each of the L limbs, other than their own: (n,
         V, L) bool."""
-        if not len(self.samples):
-            shape = len(vertices_m), len(self.vertex_limb), len(FIRST_JOINTS) + 1
-            return torch.zeros(shape, dtype=torch.bool, device=vertices_m.device)
         limb = self.vertex_limb[self.samples]
         distances_m = torch.stack([_distances_m(posed[self.samples], limb) for posed in vertices_m])
         close = (distances_m < CLOSE_M) & (distances_m < CLOSER_THAN_AT_REST * self.rest_m)
