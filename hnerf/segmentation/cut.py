@@ -52,7 +52,7 @@ def _grab_cut(picture: np.ndarray, labels: np.ndarray) -> np.ndarray:
     surroundings."""
     window = bounding_window(labels != cv2.GC_BGD)
     inside = np.ascontiguousarray(labels[window])
-    if not np.isin(inside, (cv2.GC_BGD, cv2.GC_PR_BGD)).any() or not np.isin(inside, (cv2.GC_FGD, cv2.GC_PR_FGD)).any():
+    if not np.isin(inside, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():  # the person fills the image
         return labels
     cv2.setRNGSeed(0)  # for the k-means that initialises its colour models
     background, person = np.zeros((1, 65)), np.zeros((1, 65))
