@@ -29,13 +29,13 @@ TOES, HEELS = (19, 22), (21, 24)
 
 
 def check_spread(capture: Capture, keypoints: np.ndarray) -> None:
-    """Raise InputError if all keypoints (C, frames, 25, 3) of a camera's person lie on one spot."""
+    """Raise InputError if all keypoints (C, frames, 25, 3) of a camera's person lie on one spot. Every camera shows the
+    person."""
     for name, found in zip(capture.train_cameras, keypoints, strict=True):
-        heights_px = person_heights_px(found[(found[..., 2] > 0).any(1)])
-        if len(heights_px) and np.median(heights_px) < MIN_PERSON_PX:
+        height_px = np.median(person_heights_px(found[(found[..., 2] > 0).any(1)]))
+        if height_px < MIN_PERSON_PX:
             raise InputError(
-                f"{capture.name}: camera {name}: keypoints of a person lie within {np.median(heights_px):.1f} px; "
-                "detect them again"
+                f"{capture.name}: camera {name}: keypoints of a person lie within {height_px:.1f} px; detect them again"
             )
 
 
