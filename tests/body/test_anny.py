@@ -2,7 +2,7 @@ import pytest
 import torch
 import trimesh
 
-from hnerf.body.anny import ADULT, BETA_NAMES, _coefficients, anny_rig, cavities
+from hnerf.body.anny import ADULT, BETA_NAMES, _coefficients, anny_rig, inner_skin
 from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import pose_vertices
 
@@ -23,8 +23,8 @@ def test_mouth_and_eye_sockets_are_capped() -> None:
     rig = anny_rig()
     mesh = trimesh.Trimesh(rig.vertices_m.numpy(), rig.faces.numpy(), process=False)
     assert mesh.is_winding_consistent and mesh.euler_number == 2
-    assert not cavities()[rig.faces].any()
-    lining, only = rig.vertices_m[cavities()], torch.zeros(int(cavities().sum()), dtype=torch.int32)
+    assert not inner_skin()[rig.faces].any()
+    lining, only = rig.vertices_m[inner_skin()], torch.zeros(int(inner_skin().sum()), dtype=torch.int32)
     found = BodyMeshes(rig.vertices_m[None], rig.faces).closest_points(lining, only, 1.0, exact_sign=True)
     closest = (rig.vertices_m[rig.faces[found.face]] * found.barycentric[..., None]).sum(1)
     depth_m = -found.sign * (closest - lining).norm(dim=1)
