@@ -17,7 +17,7 @@ REPORT, PICTURE = "detection.json", "people.png"
 MIN_HEIGHT_PX = 80  # in an image; the networks use 256 x 256 px around a person
 WHOLE = (2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14)  # arms and legs, without which no pose is known
 PICTURE_PX = 360  # height of each camera's image in PICTURE
-TAKEN, LEFT = (0, 200, 0), (220, 0, 0)
+GREEN, RED = (0, 200, 0), (220, 0, 0)
 
 
 def check_subject(capture: Capture, subject: PersonTrack) -> None:
@@ -97,7 +97,7 @@ def draw_people(path: Path, capture: Capture, people: list[PersonTrack]) -> None
         scale = PICTURE_PX / picture.shape[0]
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         for number, person in reversed(list(enumerate(people))):
-            _draw_person(picture, person.keypoints[c, i] * [scale, scale, 1], TAKEN if number == 0 else LEFT)
+            _draw_person(picture, person.keypoints[c, i] * [scale, scale, 1], RED if number else GREEN)
         cv2.putText(picture, f"{camera}, frame {capture.frames[i]}", (6, 16), 0, 0.45, (255, 255, 255), 2)
         cv2.putText(picture, f"{camera}, frame {capture.frames[i]}", (6, 16), 0, 0.45, (0, 0, 0), 1)
         tiles.append(picture)
