@@ -4,7 +4,6 @@ outlines."""
 import logging
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -77,11 +76,10 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * ACCELERATION_SCALE)
         up, single = "xyz".index(capture.up), len(observations.cameras) == 1
         hands, step_s = observe_hands(capture), median_step(capture.frames) / capture.fps
-        terms: dict[str, Any] = {"limb_depths": observe_limb_depths(capture, observations)}
-        seen = observations.cameras[0], observations.keypoints(0)
-        on_ground = single and is_ground(*seen, capture.up, capture.stature_m)
-        terms |= {"balance": Balance(up)} if single else {}
-        terms |= {"ground": Ground(up)} if on_ground else {}
+        limb_depths, balance = observe_limb_depths(capture, observations), Balance(up) if single else None
+        ground = None
+        if single and is_ground(observations.cameras[0], observations.keypoints(0), capture.up, capture.stature_m):
+            ground = Ground(up)
         with timed("start", seconds, log):
             pose = given_pose or initial_pose(capture, observations, model)
         palm = PalmTerm(hands) if hands and has_fingers(pose.rig) else None
@@ -93,7 +91,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 pose = levenberg_marquardt(replace(problem, in_space=True), pose, KEYPOINT_STEPS)
         with timed("keypoints in images", seconds, log):
             problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=TIGHT_STD)
-            problem = replace(problem, **terms)
+            problem = replace(problem, limb_depths=limb_depths, balance=balance, ground=ground)
             pose, posture_prior = _fit_in_images(capture, problem, pose, palm)
         if palm:
             with timed("fingers", seconds, log):
@@ -101,10 +99,10 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         if masks is not None:
             with timed("outlines", seconds, log):
                 problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
-                terms |= {"ground": Ground(up, each_foot=True)} if on_ground else {}
-                problem = replace(problem, palm=palm, posture_prior=posture_prior, **terms)
+                problem = replace(problem, limb_depths=limb_depths, balance=balance, palm=palm)
+                problem = replace(problem, ground=ground and Ground(up, each_foot=True), posture_prior=posture_prior)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
-                pose = refine_with_outlines(problem, pose, edges, up if on_ground else None, threads)
+                pose = refine_with_outlines(problem, pose, edges, up if ground else None, threads)
             with timed("clothes", seconds, log):
                 pose = refine_with_clothing(problem, pose, edges, threads)
         if palm and masks is not None:
@@ -113,7 +111,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
         report = _report(capture, masks, observations, pose, fit, seconds)
         if single:
-            report["on_ground"] = on_ground
+            report["on_ground"] = ground is not None
             _warn_of_stature(report["stature_m"], settings, capture.stature_m is not None)
         if given_pose:
             report["given_poses"] = given_poses_note(model, capture)
