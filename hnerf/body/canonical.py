@@ -233,10 +233,7 @@ class PosedBodies:
         carried = (self._joint_shape.unflatten(1, (3, -1)) @ correction.shape).unflatten(0, (len(shift), -1))
         posed = (frame * len(bulge) + nearest).int()
         bodies = (self._subtree_weights, self._linear.flatten(0, 1), self._skin_joints, self.rig.skin_weights)
-        found: Tensor = Displacement.apply(
-            torch.stack([correction.turn, shift], 2), bulge, carried, points_m, posed, *bodies
-        )
-        return found
+        return Displacement.apply(torch.stack([correction.turn, shift], 2), bulge, carried, points_m, posed, *bodies)
 
     @torch.no_grad()
     def absorb(self, correction: PoseCorrection, same_posture: Tensor | None = None) -> None:

@@ -55,10 +55,7 @@ class Outline:
 
     def distance_at(self, points_px: np.ndarray) -> np.ndarray:
         """Return the signed distance (N,) px of points (N, 2); outside the image, that of the nearest pixel."""
-        distance_px: np.ndarray = map_coordinates(
-            self.distance_px, points_px.T[::-1] / self.stride, order=1, mode="nearest"
-        )
-        return distance_px
+        return np.asarray(map_coordinates(self.distance_px, points_px.T[::-1] / self.stride, order=1, mode="nearest"))
 
 
 @dataclass(frozen=True)

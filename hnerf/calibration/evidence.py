@@ -37,8 +37,7 @@ class Evidence:
     @staticmethod
     def of(capture: Capture, keypoints: np.ndarray) -> "Evidence":
         """Collect the evidence of a capture: the given keypoints, and what its images show."""
-        outlines, matches = Outlines.of(capture), Matches.of(capture)
-        return Evidence(capture, keypoints, outlines, matches, board_evidence(capture))
+        return Evidence(capture, keypoints, Outlines.of(capture), Matches.of(capture), board_evidence(capture))
 
     def summarise(self, cameras: Sequence[Camera], found: Measure) -> dict[str, Any]:
         """Return the residuals in pixels of each kind of evidence for each of these cameras. found: what `measure`
