@@ -4,6 +4,8 @@ One image hardly distinguishes a body that leans towards the camera from an upri
 see the difference, so the prior is used with one camera only.
 """
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -35,23 +37,21 @@ def centre_of_mass_over_feet() -> Tensor:
     return shares
 
 
+@dataclass(frozen=True)
 class Balance:
     """A prior on the horizontal distance of the centre of mass from the midpoint of the ankles, with a standard
-    deviation of 5 cm in either direction; Geman-McClure weights release it in a step or a jump."""
+    deviation of 5 cm in either direction; Geman-McClure weights release it in a step or a jump. up: index of the
+    world's vertical axis."""
 
-    def __init__(self, up: int) -> None:
-        """Prepare the prior; `up` is the index of the world's vertical axis."""
-        self.level = [axis for axis in range(3) if axis != up]
-        self.shares = centre_of_mass_over_feet()
+    up: int
 
     def add(self, equations: NormalEquations, keypoints_m: Tensor, jacobian: Tensor) -> float:
         """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), jacobian (n, 25, 3, U).
 
         Shared unknowns are left alone: nobody keeps their balance by changing shape.
         """
-        off, by_frame = (
-            torch.einsum("k,nkc...->nc...", self.shares, t)[:, self.level] for t in (keypoints_m, jacobian)
-        )
+        shares, level = centre_of_mass_over_feet(), [axis for axis in range(3) if axis != self.up]
+        off, by_frame = (torch.einsum("k,nkc...->nc...", shares, t)[:, level] for t in (keypoints_m, jacobian))
         weight, cost = geman_mcclure(off.square().sum(-1), BALANCE_M, OUTLIER_M)
         weighted = weight[:, None, None] * by_frame
         equations.frame[0] += (weighted.mT @ by_frame).numpy()
