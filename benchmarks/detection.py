@@ -63,7 +63,7 @@ def measure(folder: Path, scratch: Path) -> dict[str, Any]:
     train, novel = (
         tuple(f for f in frames if f in part) for part in (everything.train_frames, everything.novel_pose_frames)
     )
-    subset(everything, scratch / "capture", None, train, novel)
+    subset(everything, scratch / "capture", train_frames=train, novel_pose_frames=novel)
     capture = Capture.load(scratch / "capture")
     score = score_truth if (folder / "ground_truth").is_dir() else score_residuals
     figures = {DELIVERED: score(folder, capture)}

@@ -28,9 +28,9 @@ def require_several_cameras(capture: Capture) -> None:
 def subset(
     capture: Capture,
     out: Path,
-    cameras: tuple[str, ...] | None,
-    train_frames: tuple[int, ...] | None,
-    novel_pose_frames: tuple[int, ...] | None,
+    cameras: tuple[str, ...] | None = None,
+    train_frames: tuple[int, ...] | None = None,
+    novel_pose_frames: tuple[int, ...] | None = None,
 ) -> None:
     """Write another normalised capture into `out` with only these training cameras and frames; None keeps all.
 

@@ -45,7 +45,7 @@ def test_given_poses_stay_with_their_frames(tmp_path: Path) -> None:
     poses.theta[:], poses.root[:] = 0, 0
     poses.theta[:, 0, 0] = poses.root[:, 0, 0] = capture.frames
     poses.save(capture.root / "poses.npz")
-    subset(capture, tmp_path / "few", None, (6, 2), (10,))
+    subset(capture, tmp_path / "few", train_frames=(6, 2), novel_pose_frames=(10,))
     few = Capture.load(tmp_path / "few").given_poses()
     assert few is not None
     assert few.theta[:, 0, 0].tolist() == few.root[:, 0, 0].tolist() == [2, 6, 10]
@@ -56,11 +56,11 @@ def test_a_subject_named_in_a_camera_left_out_is_named_in_another(tmp_path: Path
     capture, each = recorded(tmp_path / "all", ring(3), *people_m)
     x, y, _ = each[1]["c1"][7, 0]
     capture = dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c1", 7))
-    subset(capture, tmp_path / "few", ("c0", "c2"), None, None)
+    subset(capture, tmp_path / "few", ("c0", "c2"))
     few = Capture.load(tmp_path / "few")
     assert few.subject_point is not None and few.subject_point.camera == "c0"
     assert share_right(subject_keypoints(few), {name: each[1][name] for name in ("c0", "c2")}) == 1
-    subset(capture, tmp_path / "kept", ("c1", "c2"), None, None)
+    subset(capture, tmp_path / "kept", ("c1", "c2"))
     assert Capture.load(tmp_path / "kept").subject_point == capture.subject_point
 
 
@@ -70,14 +70,14 @@ def test_a_subject_named_in_a_frame_left_out_is_named_in_another(tmp_path: Path)
     capture, each = recorded(tmp_path / "all", ring(3), *people_m)
     x, y, _ = each[0]["c1"][0, 0]
     capture = dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c1", 0))
-    subset(capture, tmp_path / "few", None, tuple(range(22, 30)), ())
+    subset(capture, tmp_path / "few", train_frames=tuple(range(22, 30)), novel_pose_frames=())
     late = {name: seen[22:] for name, seen in each[0].items()}
     assert share_right(subject_keypoints(Capture.load(tmp_path / "few")), late) == 1
 
 
 def test_none_keeps_everything(tmp_path: Path) -> None:
     capture = write_recording(tmp_path / "all")
-    subset(capture, tmp_path / "same", None, None, None)
+    subset(capture, tmp_path / "same")
     folders = capture.root, tmp_path / "same"
     before, after = ({p.relative_to(root): p.read_bytes() for p in root.rglob("*.png")} for root in folders)
     assert before == after
@@ -88,8 +88,8 @@ def test_none_keeps_everything(tmp_path: Path) -> None:
 def test_a_missing_camera_or_frame_is_refused(tmp_path: Path) -> None:
     capture = write_recording(tmp_path / "all")
     with pytest.raises(InputError, match="ada: no training camera 03; there are 01, 02"):
-        subset(capture, tmp_path / "a", ("03",), None, None)
+        subset(capture, tmp_path / "a", ("03",))
     with pytest.raises(InputError, match="ada: no training frame 8; there are 2, 4, 6"):
-        subset(capture, tmp_path / "b", None, (8,), None)
+        subset(capture, tmp_path / "b", train_frames=(8,))
     with pytest.raises(InputError, match="no training camera or frame would be left"):
-        subset(capture, tmp_path / "c", None, (), None)
+        subset(capture, tmp_path / "c", train_frames=())

@@ -16,12 +16,13 @@ T = TypeVar("T")
 
 def keep_cameras(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
     """Keep `count` training cameras, drawn at random. Raises NotApplicableError if there are no more than `count`."""
-    subset(capture, out, _random_subset(capture.name, "cameras", capture.train_cameras, count, rng), None, None)
+    subset(capture, out, _random_subset(capture.name, "cameras", capture.train_cameras, count, rng))
 
 
 def keep_frames(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
     """Keep `count` training frames, drawn at random. Raises NotApplicableError if there are no more than `count`."""
-    subset(capture, out, None, _random_subset(capture.name, "frames", capture.train_frames, count, rng), None)
+    kept = _random_subset(capture.name, "frames", capture.train_frames, count, rng)
+    subset(capture, out, train_frames=kept)
 
 
 def rotate_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, out: Path) -> None:
@@ -31,7 +32,7 @@ def rotate_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, 
     axis = rng.normal(size=3)
     turn = cv2.Rodrigues(np.deg2rad(angle_deg) * axis / np.linalg.norm(axis))[0]
     turned = dataclasses.replace(camera, R=turn @ camera.R, t_m=turn @ camera.t_m)
-    subset(capture.with_cameras(capture.cameras | {camera.name: turned}), out, None, None, None)
+    subset(capture.with_cameras(capture.cameras | {camera.name: turned}), out)
 
 
 def delay_camera(capture: Capture, frames: float, rng: np.random.Generator, out: Path) -> None:
