@@ -90,20 +90,15 @@ class CalibrationReport:
             draw_evidence(out / "witnesses.png", self.evidence, used, self.after)
 
     def _to_dict(self) -> dict[str, Any]:
+        measured = {"before": self.before, "after": self.after}
         return {
             "verdict": self.verdict,
             "doubts": self.doubts,
             "cameras": {name: v.to_dict() for name, v in self.verdicts.items()},
             "unjudged_cameras": [name for name in self.cameras if name not in self.verdicts],
             "body_height_m": self.after and self.after.body_height_m,
-            "trimmed_cost_px": {
-                "before": self.before and self.before.cost_px,
-                "after": self.after and self.after.cost_px,
-            },
-            "trimmed_cost_without_px": {
-                "before": self.before and self.before.cost_without_px,
-                "after": self.after and self.after.cost_without_px,
-            },
+            "trimmed_cost_px": {when: found and found.cost_px for when, found in measured.items()},
+            "trimmed_cost_without_px": {when: found and found.cost_without_px for when, found in measured.items()},
             "held_out_cost_px": self.held_out_px,
             "outlines_cost_px": self.outlines_px,
             "notes": self.notes,
