@@ -116,7 +116,7 @@ class PosturePrior:
         weight *= self.trust
         pull, size = (weight[..., None] * off).flatten(1).numpy(), 3 * len(self.held)
         matrix, at = off.new_zeros(len(off), len(self.held), 3, len(self.held), 3), torch.arange(len(self.held))
-        matrix[:, at, :, at] = weight.T[..., None, None] * self.held[:, None]
+        matrix[:, at, :, at] = weight.T[..., None, None] * self.held[:, None]  # a block on the diagonal for each joint
         weights = matrix.reshape(len(off), size, size).numpy()
         equations.frame_gradient[:, 6:] += pull
         equations.frame[0][:, 6:, 6:] += weights

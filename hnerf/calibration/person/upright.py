@@ -83,6 +83,7 @@ def _upright(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) ->
         counts = [0.5 * min(1.0, frame_s / STEP_S), 1.0, 1.0]  # the frames of one step of each foot count as one
         A = np.concatenate([np.sqrt(count) * part for part, count in zip(rows, counts, strict=True)])
         off = np.concatenate([part[:, 3] for part in rows])
+        # The two residuals of the body are those of one direction, so they get one weight.
         off[len(feet_m) : len(feet_m) + 2] = np.linalg.norm(off[len(feet_m) : len(feet_m) + 2])
         weights = 1 / (1 + (off / scale) ** 2)
         normal = (A[:, :3] * weights[:, None]).T @ A[:, :3] + 1e-9 * np.eye(3)
