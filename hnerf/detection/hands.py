@@ -39,12 +39,12 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
     Test cameras are never read. Raises InputError if the network is missing or there is no subject.
     """
     cv2.setNumThreads(1)
-    of_thread, people = _NetworkOfThread(), subject_keypoints(capture)
+    network, people = HandNetwork(), subject_keypoints(capture)
     images = [(name, number) for name in capture.train_cameras for number in range(len(capture.frames))]
 
     def find(image: tuple[str, int]) -> np.ndarray:
         name, number = image
-        return find_hands(capture.image(name, capture.frames[number]), people[name][number], of_thread.network)
+        return find_hands(capture.image(name, capture.frames[number]), people[name][number], network)
 
     found = list(tracked(side_by_side(find, images), "hands", len(images)))
     stacked = np.stack(found).reshape(len(capture.train_cameras), len(capture.frames), 2, POINTS, 3)
@@ -54,8 +54,8 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
     return {name: float((hands[..., 0, 2] > FOUND).mean()) for name, hands in by_camera.items()}
 
 
-class HandNetwork:
-    """The hand network, with its outputs decoded."""
+class HandNetwork(threading.local):
+    """The hand network, with its outputs decoded. Each thread loads its own: it is not safe to share."""
 
     def __init__(self) -> None:
         """Load the network. Raises InputError if its file is missing or altered."""
@@ -67,13 +67,6 @@ class HandNetwork:
         raw, presence = self._network(region.crop(image, SIZE) / 255)[:2]
         pixels = region.to_image(raw.reshape(-1, 3)[:, :2].astype(np.float64), SIZE)
         return np.column_stack([pixels, np.full(POINTS, float(presence[0]))])
-
-
-class _NetworkOfThread(threading.local):
-    """One hand network per thread: it is not safe to share."""
-
-    def __init__(self) -> None:
-        self.network = HandNetwork()
 
 
 def find_hands(image: np.ndarray, keypoints: np.ndarray, network: HandNetwork) -> np.ndarray:

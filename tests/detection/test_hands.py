@@ -96,13 +96,13 @@ def test_each_thread_has_its_own_network_and_hands_keep_the_order_of_images(
     }
     used: dict[object, set[int]] = {}
 
-    def find(image: np.ndarray, keypoints: np.ndarray, network: object) -> np.ndarray:
-        used.setdefault(network, set()).add(threading.get_ident())
+    def find(image: np.ndarray, keypoints: np.ndarray, network: HandNetwork) -> np.ndarray:
+        used.setdefault(network._network, set()).add(threading.get_ident())
         return np.full((2, 21, 3), keypoints[0, 0])
 
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     monkeypatch.setattr(hands, "subject_keypoints", lambda recording: people)
-    monkeypatch.setattr(hands, "HandNetwork", object)
+    monkeypatch.setattr(hands, "Network", lambda name: object())
     monkeypatch.setattr(hands, "find_hands", find)
     assert detect_hands(capture, tmp_path / "out") == {"01": 0.8, "02": 1.0}
     assert max(map(len, used.values())) == 1
