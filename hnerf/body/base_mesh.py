@@ -129,5 +129,4 @@ def _in_socket(rig: Rig, eye_m: np.ndarray) -> torch.Tensor:
     near = np.linalg.norm(template_m - eye_m.mean(0), axis=1) < EYE_RADIUS_M
     before_m, after_m = template_m[near], shaped_m[near]
     scale = np.sqrt(after_m.var(0).sum() / before_m.var(0).sum())
-    placed_m = after_m.mean(0) + scale * (eye_m - before_m.mean(0))
-    return torch.from_numpy(placed_m).to(rig.vertices_m)
+    return torch.from_numpy(after_m.mean(0) + scale * (eye_m - before_m.mean(0))).to(rig.vertices_m)

@@ -261,8 +261,7 @@ def _timing(view: _View) -> Timing:
 
 
 def _jackknife_error(values: Sequence[float]) -> float:
-    n = len(values)
-    return float(np.sqrt((n - 1) * np.var(values)))
+    return float(np.sqrt((len(values) - 1) * np.var(values)))
 
 
 def _view(cameras: Sequence[Camera], keypoints: np.ndarray, index: int, frames: Sequence[int]) -> _View:

@@ -68,8 +68,7 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     for name, subject in zip(capture.train_cameras, ranked[0].keypoints, strict=True):
         keep_subject(out, capture, name, subject, people[name], _load(out, name, "masks", "regions"))
     draw_people(out / PICTURE, detected, ranked)
-    cameras = {name: _summary(people) for name, people in found.items()}
-    report = {"cameras": cameras, "people": people_rows(ranked)}
+    report = {"cameras": {name: _summary(people) for name, people in found.items()}, "people": people_rows(ranked)}
     (out / REPORT).write_text(json.dumps(report, indent=1))
     return report | {"ms": ms}
 
@@ -126,8 +125,7 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> float
     """
     cv2.setNumThreads(1)
     started = time.perf_counter()
-    frames = tracked(capture.frames, "detection", len(capture.frames))
-    images = (capture.image(camera, frame) for frame in frames)
+    images = (capture.image(camera, frame) for frame in tracked(capture.frames, "detection", len(capture.frames)))
     everybody = []
     for frame, people in zip(capture.frames, track(images, PersonDetector(), LandmarkNetwork(size)), strict=True):
         write_image(out / PERSON / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))

@@ -60,6 +60,5 @@ def _held_out_px(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence
     costs_px = []
     for fitted, judged in held_out_parts(keypoints):
         found, k1 = fit(cameras, fitted)
-        straight = undistort(judged, found, unknown, k1)
-        costs_px.append(trimmed_cost_px(found, straight))
+        costs_px.append(trimmed_cost_px(found, undistort(judged, found, unknown, k1)))
     return float(np.mean(costs_px))

@@ -113,8 +113,7 @@ def read_intrinsics(path: Path) -> dict[str, Lens]:
     intri = _CalibrationFile(path)
     if not any(f"K_{name}" in intri.tree for name in intri.names()):  # an extri.yml
         raise InputError(f"{path}: has no intrinsics (K_<camera>); give an intri.yml")
-    lenses = (_lens(name, intri, None) for name in intri.names())
-    return {lens.name: lens for lens in lenses}
+    return {name: _lens(name, intri, None) for name in intri.names()}
 
 
 class _CalibrationFile:
