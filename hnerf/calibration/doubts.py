@@ -161,8 +161,8 @@ def doubts_about_pictures(capture: Capture, keypoints: np.ndarray) -> list[str]:
         ]
     shares, lines = {name: _share(hits) for name, hits in on.items()}, []
     for name in shares:
-        others = {f"those of camera {other}": np.nan_to_num(_on(people[name], detected[other])) for other in shares}
-        del others[f"those of camera {name}"]
+        rest = [other for other in shares if other != name]
+        others = {f"those of camera {other}": np.nan_to_num(_on(people[name], detected[other])) for other in rest}
         undone = others | {"mirrored": mirrored[name], "in reverse order": _on(people[name][::-1], detected[name])}
         lines += _worse(name, shares, {what: _share(hits) for what, hits in undone.items()})
     return lines
