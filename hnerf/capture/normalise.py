@@ -52,7 +52,7 @@ class Normaliser:
         return recorded
 
     def keypoints(self, recorded: np.ndarray) -> np.ndarray:
-        """Convert recorded keypoints (..., 25, 3) x_px, y_px, confidence to the linear camera; points without
+        """Convert recorded keypoints (..., 3) x_px, y_px, confidence to the linear camera; points without
         confidence, and those outside the lens's valid image area, become zero."""
         if self.maps is not None:
             recorded = undistort_keypoints(recorded, self.lens.K, self.lens.distortion)
