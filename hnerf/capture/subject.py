@@ -41,8 +41,9 @@ def ranked_people(capture: Capture) -> list[PersonTrack]:
     tracks = (follow_in_each_camera if uncalibrated else follow_people)(cameras, people)
     if not tracks:
         raise InputError(f"{capture.name}: no person found in any frame; check the keypoint files")
-    if capture.subject_point:
-        distances = [_distance(capture, capture.subject_point, track) for track in tracks]
+    if point := capture.subject_point:
+        _check_point(capture, point)
+        distances = [_distance(capture, point, track) for track in tracks]
         order = np.argsort(distances, kind="stable")
         if not np.isfinite(distances[order[0]]):
             raise InputError(f"{capture.name}: capture.toml: subject: nobody is found there; name another point")
@@ -84,24 +85,28 @@ def _too_few(names: tuple[str, ...], seen: np.ndarray) -> str:
     return "no person found in any frame by enough cameras; check the keypoint files"
 
 
+def _check_point(capture: Capture, point: SubjectPoint) -> None:
+    """Raise InputError if the training cameras cannot tell how far people are from a point."""
+    if not point.camera and len(capture.train_cameras) == 1:
+        raise InputError(
+            f"{capture.name}: capture.toml: subject: one camera tells no places on the ground; name a point in its "
+            "image"
+        )
+    if point.camera and point.camera not in capture.train_cameras:
+        raise InputError(
+            f"{capture.name}: the subject is named in camera {point.camera}, which is left out; name another"
+        )
+
+
 def _distance(capture: Capture, point: SubjectPoint, person: PersonTrack) -> float:
     """Return how far a person is from a point: in metres on the ground, or in pixels of a camera; infinite where not
     seen."""
     if not point.camera:
         cameras = [capture.cameras[name] for name in capture.train_cameras]
-        if len(cameras) == 1:
-            raise InputError(
-                f"{capture.name}: capture.toml: subject: one camera tells no places on the ground; name a point in its "
-                "image"
-            )
         points_m, _, _ = triangulate(cameras, person.keypoints[:, :, MIDDLE])
         ground = points_m[..., ["xyz".index(axis) for axis in "xyz" if axis != capture.up]]
         known = ground[np.isfinite(ground).all(-1)]
         return float(np.linalg.norm(np.median(known, axis=0) - point.at)) if len(known) else np.inf
-    if point.camera not in capture.train_cameras:
-        raise InputError(
-            f"{capture.name}: the subject is named in camera {point.camera}, which is left out; name another"
-        )
     frame = np.abs(np.array(capture.frames) - point.frame).argmin()  # the named frame may have been left out
     keypoints = person.keypoints[capture.train_cameras.index(point.camera), frame]
     seen = keypoints[keypoints[:, 2] > 0, :2]
