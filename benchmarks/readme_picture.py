@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import trimesh
 from provenance import arguments
 
 from hnerf.avatar.surface import posed_surface
@@ -35,10 +34,10 @@ def main() -> None:
     box = frame_person(drawn.alpha.numpy() > 0.5)
     close = cropped_camera(camera, box)
     photograph = crop(capture.image(options.camera, options.frame), box)
-    body = trimesh.Trimesh(fitted.vertices_m()[row].numpy(), fitted.rig.faces.numpy(), process=False)
+    body = Surface.of(fitted.vertices_m()[row].numpy(), fitted.rig.faces.numpy())
     panels = [
         photograph,
-        overlay_surface(photograph, Surface(body), close),
+        overlay_surface(photograph, body, close),
         crop(rendered, box),
         clay(shoot(Surface(posed_surface(avatar, options.frame)), close)),
     ]

@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-import trimesh
 
 from hnerf.asset.pictures import looks_on_black, splats_on_black
 from hnerf.asset.rigs import FULL
@@ -129,10 +128,8 @@ def _skinned_surfaces(staged: StagedAvatar, frames: list[int]) -> dict[int, Surf
     wanted = sorted(set(frames))
     rows = [list(staged.frames).index(frame) for frame in wanted]
     moved = staged.rigs[FULL].surfaces_m(CAPTURED, staged.rest, rows)
-    return {
-        frame: Surface(trimesh.Trimesh(points_m @ staged.stage_from_world, staged.faces, process=False))
-        for frame, points_m in zip(wanted, moved, strict=True)
-    }
+    surfaces = (Surface.of(points_m @ staged.stage_from_world, staged.faces) for points_m in moved)
+    return dict(zip(wanted, surfaces, strict=True))
 
 
 def _compared(

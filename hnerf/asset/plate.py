@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -80,7 +79,7 @@ def facing_pairs(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[csr_array, 
     """Return the matrix (P, V) of differences between a vertex and the point that its outward normal hits across an air
     gap, and the widths (P,) of the gaps."""
     normals = normals_of(vertices_m, faces)
-    surface = Surface(trimesh.Trimesh(vertices_m, faces, process=False))
+    surface = Surface.of(vertices_m, faces)
     hits = surface.cast(vertices_m + START_M * normals, normals)
     opposite = (surface.mesh.face_normals[hits.face] * normals).sum(1) < 0
     vertex = np.flatnonzero((hits.face >= 0) & (hits.distance_m < GAP_M) & opposite)

@@ -74,7 +74,7 @@ def _match(
 def _thickness_m(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return how far the inward normal of each vertex runs inside the mesh, (V,)."""
     inward = -normals_of(vertices_m, faces)
-    surface = Surface(trimesh.Trimesh(vertices_m, faces, process=False))
+    surface = Surface.of(vertices_m, faces)
     hits = surface.cast(vertices_m + START_M * inward, inward)
     return np.where(hits.face >= 0, hits.distance_m, 0) + START_M
 

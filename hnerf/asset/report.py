@@ -7,7 +7,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import trimesh
 
 from hnerf.asset.comparison import Compared
 from hnerf.asset.extreme_poses import ExtremePose
@@ -42,7 +41,7 @@ def write_report(
     the body, Z up and facing -Y, in that frame; figures: the content of `report.json`."""
     facing = avatar.stage_from_world @ -world_from_body[:3, 1]
     points_m = avatar.points_m[list(avatar.frames).index(frame)].astype(np.float64)
-    surface = Surface(trimesh.Trimesh(points_m, avatar.faces, process=False))
+    surface = Surface.of(points_m, avatar.faces)
     shots = list(side_by_side(partial(shoot, surface), turntable_cameras(points_m, facing, TURNS)))
     front, back = shots[0], shots[TURNS // 2]
     page = report_environment(TEMPLATES).get_template("asset.html")
@@ -86,11 +85,8 @@ def _beside_field(view: Compared) -> list[GalleryPicture]:
 
 def _less_detail(avatar: StagedAvatar, points_m: np.ndarray, camera: Camera) -> list[GalleryPicture]:
     """Return the wireframe of each lower level of detail."""
-    meshes = [trimesh.Trimesh(points_m[lv.vertices], lv.faces, process=False) for lv in avatar.levels[1:]]
-    return [
-        _picture(f"lod{level}, {len(mesh.faces)} triangles", wireframe(shoot(Surface(mesh), camera)))
-        for level, mesh in enumerate(meshes, 1)
-    ]
+    shots = [shoot(Surface.of(points_m[lv.vertices], lv.faces), camera) for lv in avatar.levels[1:]]
+    return [_picture(f"lod{k}, {len(shot.mesh.faces)} triangles", wireframe(shot)) for k, shot in enumerate(shots, 1)]
 
 
 def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:
@@ -106,8 +102,8 @@ def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:
 
 def _extreme(avatar: StagedAvatar, pose: ExtremePose) -> list[GalleryPicture]:
     """Return a pose in clay and textured."""
-    surface = Surface(trimesh.Trimesh(pose.points_m, avatar.faces, process=False))
-    shot = shoot(surface, turntable_cameras(pose.points_m[pose.shown], FRONT, 1)[0])
+    camera = turntable_cameras(pose.points_m[pose.shown], FRONT, 1)[0]
+    shot = shoot(Surface.of(pose.points_m, avatar.faces), camera)
     return [
         _picture(f"{pose.name}: {100 * pose.crossing:.1f} % of faces cross", clay(shot)),
         _picture(pose.name, textured(shot, avatar)),

@@ -68,7 +68,8 @@ def view_row(
         cut_mask = pictures.crop(mask.astype(np.uint8) * 255, box) > 127
         row.append(("Mask", pictures.show_mask(cut_image, cut_mask)))
     if body is not None:
-        row.append(("Fitted body", pictures.overlay_surface(cut_image, Surface(_body_mesh(body, view.frame)), camera)))
+        surface = Surface.of(pose_vertices(body.rig, *body.pose(view.frame)).numpy(), body.rig.faces.numpy())
+        row.append(("Fitted body", pictures.overlay_surface(cut_image, surface, camera)))
     row.append(("Render", cut_rendered))
     if reference is not None:
         caption, cut_reference = reference[0], pictures.crop(reference[1], box)
@@ -105,12 +106,6 @@ def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None
         row += [(f"Ground truth, {side}", pictures.clay(shot)) for side, shot in true_shots.items()]
         row += [(f"Distance, {side}", pictures.distance_map(shot, true_surface)) for side, shot in shots.items()]
     return Row(f"Frame {frame}", note, _captioned(row))
-
-
-def _body_mesh(body: BodyFit, frame: int) -> trimesh.Trimesh:
-    """Return the unclothed body in the pose of a frame."""
-    vertices_m = pose_vertices(body.rig, *body.pose(frame))
-    return trimesh.Trimesh(vertices_m.numpy(), body.rig.faces.numpy(), process=False)
 
 
 def _captioned(row: list[tuple[str, np.ndarray]]) -> list[GalleryPicture]:

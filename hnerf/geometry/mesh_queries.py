@@ -61,6 +61,11 @@ class Surface:
             support_winding_number=True,
         )
 
+    @classmethod
+    def of(cls, vertices_m: np.ndarray, faces: np.ndarray) -> "Surface":
+        """Prepare the mesh of vertices (V, 3) and faces (F, 3), unchanged."""
+        return cls(trimesh.Trimesh(vertices_m, faces, process=False))
+
     def closest(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance in metres from each point to the surface, (N,), and the nearest face, (N,)."""
         n = len(points_m)

@@ -4,7 +4,6 @@ points."""
 from itertools import combinations
 
 import numpy as np
-import trimesh
 
 from hnerf.avatar.avatar import Gains
 from hnerf.body.fit_result import BodyFit
@@ -36,7 +35,7 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
     ratios: dict[tuple[int, int], list[np.ndarray]] = {pair: [] for pair in combinations(range(len(names)), 2)}
     vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
     for frame in evenly_spaced(capture.train_frames, MAX_FRAMES) if ratios else ():
-        surface = Surface(trimesh.Trimesh(vertices_m[body.index(frame)], faces, process=False))
+        surface = Surface.of(vertices_m[body.index(frame)], faces)
         levels = [_vertex_colours(capture, masks, surface, name, frame) for name in names]
         for (a, b), found in ratios.items():
             both = np.isfinite(levels[a] + levels[b]).all(1)

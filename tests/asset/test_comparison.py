@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import trimesh
 from torch import Tensor
 
 from hnerf.asset import comparison
@@ -94,7 +93,7 @@ def test_the_albedo_is_rendered_in_its_light_with_the_cameras_exposure(recorded:
     points_m = staged.points_m[list(staged.frames).index(4)] @ staged.stage_from_world
     shown = found.renders["albedo"]
     row, column = np.argwhere(shown[..., 3] == 255).mean(0).astype(int)
-    surface = Surface(trimesh.Trimesh(points_m, staged.faces, process=False))
+    surface = Surface.of(points_m, staged.faces)
     hits = surface.cast(*side_camera().rays(np.array([[column + 230.0, row + 100]])))  # from the box's corner
     normal = hits.barycentric[0] @ normals_of(points_m, staged.faces)[staged.faces[hits.face[0]]]
     linear = 0.5 * (0.5 + 2 / 3 * -0.3 * 3**0.5 * (staged.stage_from_world @ normal)[2] / np.linalg.norm(normal))

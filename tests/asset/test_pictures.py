@@ -2,7 +2,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import trimesh
 
 from hnerf.asset import pictures
 from hnerf.asset.levels import Level
@@ -27,7 +26,7 @@ def card(staged: StagedAvatar) -> StagedAvatar:
 
 
 def surface_of(card: StagedAvatar) -> Surface:
-    return Surface(trimesh.Trimesh(card.points_m[0], card.faces, process=False))
+    return Surface.of(card.points_m[0], card.faces)
 
 
 def test_the_texture_is_seen_upright_from_the_front(card: StagedAvatar) -> None:

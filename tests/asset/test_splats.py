@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from scipy.spatial.transform import Rotation
 
@@ -219,7 +218,7 @@ def test_rendered_splats_look_like_the_rendered_mesh(staged: StagedAvatar) -> No
     found, camera, gain = surface_splats(grey, 20_000), side_camera().scaled(0.5), (0.5, 1.0, 3.0)
     points_m = staged.points_m[1].astype(float) @ staged.stage_from_world
     drawn = splats_on_black(found, points_m, camera, camera.size_px, gain)
-    surface = Surface(trimesh.Trimesh(points_m, staged.faces, process=False))
+    surface = Surface.of(points_m, staged.faces)
     mesh = looks_on_black(surface, grey, camera, camera.size_px, gain)["asset"]
     inside = mesh[..., 3] == 255
     assert np.abs(drawn[inside].astype(int) - (60, 120, 255, 255)).max(1).mean() < 3

@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from hnerf.asset.compact_glb import read_glb
@@ -355,7 +354,7 @@ def decoded(uri: str) -> np.ndarray:
 
 def outline(world_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the pixels where the side camera sees a surface, (480, 640) bool."""
-    hits = cast_pixels(Surface(trimesh.Trimesh(world_m, faces, process=False)), side_camera())
+    hits = cast_pixels(Surface.of(world_m, faces), side_camera())
     return (hits.face >= 0).reshape(480, 640)
 
 
