@@ -14,10 +14,9 @@ import torch
 from provenance import arguments, provenance, provenance_line, table, write_result
 from score_shared import GEOMETRY_COLUMNS, IMAGE_COLUMNS, score_cells
 
+from hnerf.avatar.finished import recording_of
 from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.report import load_cameras
-from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import load_settings
 from hnerf.evaluation.evaluate import evaluate
@@ -39,7 +38,7 @@ def main() -> None:
     result = provenance() | {"preset": options.preset, "overrides": options.overrides}
     settings = load_settings(options.preset, options.overrides)
     folders = {name: options.subject / name for name in ("calibration", "segmentation", "fit")}
-    capture = load_cameras(folders["calibration"], Capture.load(options.subject / "capture"))
+    capture = recording_of(options.subject)
     masks, body = Masks.load(folders["segmentation"]), BodyFit.load(folders["fit"])
     training, evaluation = options.out / "training", options.out / "evaluation"
     for folder in (training, evaluation):

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 from provenance import arguments
 
+from hnerf.avatar.finished import recording_of
 from hnerf.avatar.surface import posed_surface
 from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.report import load_cameras
-from hnerf.capture.capture import Capture
 from hnerf.evaluation.pictures import clay, crop, cropped_camera, frame_person, overlay_surface, shoot
 from hnerf.geometry.mesh_queries import Surface
 
@@ -26,7 +25,7 @@ def main() -> None:
     parser.add_argument("--frame", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("docs/valid-wave.png"))
     options = parser.parse_args()
-    capture = load_cameras(options.subject / "calibration", Capture.load(options.subject / "capture"))
+    capture = recording_of(options.subject)
     fitted, avatar = BodyFit.load(options.subject / "fit"), load_avatar(options.subject / "training", "cpu")
     camera, row = capture.cameras[options.camera], avatar.body.index(options.frame)
     drawn = avatar.render(camera, avatar.body.theta[row], avatar.body.root[row])

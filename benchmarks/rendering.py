@@ -14,9 +14,7 @@ import torch
 from provenance import SHARED, provenance, provenance_line, store_and_captures, table, write_result
 
 from flows.train_subject import train_subject
-from hnerf.avatar.trained import load_avatar
-from hnerf.calibration.report import load_cameras
-from hnerf.capture.capture import Capture
+from hnerf.avatar.finished import avatar_of, recording_of
 from hnerf.study.benchmark.scoring import frame_seconds
 
 CAPTURES = ("valid-wave", "valid-walk", "valid-turn-mono")
@@ -39,8 +37,7 @@ def main() -> None:
 
 def measure(subject: Path, cores: list[int]) -> dict[str, float]:
     """Return the median seconds, by longest side and number of threads."""
-    avatar = load_avatar(subject / "training")
-    capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
+    avatar, capture = avatar_of(subject), recording_of(subject)
     camera = capture.cameras[(*capture.test_cameras, *capture.train_cameras)[0]]
     found = {}
     for side_px in SIDES_PX:

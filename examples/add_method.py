@@ -9,10 +9,9 @@ from unittest.mock import patch
 
 from torch import nn, ones, stack
 
+from hnerf.avatar.finished import recording_of
 from hnerf.baselines.nerf import NerfField
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.report import load_cameras
-from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import NerfSettings, load_settings
 from hnerf.fields.sparse_grids import SparseGrids
@@ -36,7 +35,7 @@ class VoxelField(NerfField):
 
 
 def main(subject, out, overrides=()):
-    capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
+    capture = recording_of(subject)
     capture = replace(capture, train_frames=capture.train_frames[:1])
     masks, body = Masks.load(subject / "segmentation"), BodyFit.load(subject / "fit")
     with patch.object(trainer, "build_field", lambda settings, body, static: VoxelField(body)):

@@ -8,17 +8,15 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from hnerf.avatar.trained import load_avatar
-from hnerf.calibration.report import load_cameras
-from hnerf.capture.capture import Capture, write_image
+from hnerf.avatar.finished import avatar_of, recording_of
+from hnerf.capture.capture import write_image
 from hnerf.evaluation.images import rgba
 from hnerf.render.trajectory import interpolate_cameras
 
 
 def main(subject: Path, out: Path, pictures: int = 60, side_px: int = 256) -> None:
     """Write `pictures` square images, in which the person moves through all fitted frames."""
-    capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
-    avatar = load_avatar(subject / "training")
+    capture, avatar = recording_of(subject), avatar_of(subject)
     recorded = [capture.cameras[name].resized(side_px, side_px) for name in capture.train_cameras]
     path = interpolate_cameras([*recorded, recorded[0]], pictures)
     frames = avatar.body.frames
