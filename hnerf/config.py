@@ -343,7 +343,7 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
 
     Raises InputError with one line if there is no such preset, it is not YAML, or a key or value is not allowed.
     """
-    path = named_file(preset, CONFIGS, "preset", "presets")
+    path = named_file(preset, CONFIGS, "preset")
     return overridden(validated(Settings, preset_tree(path), path), overrides)
 
 
@@ -357,7 +357,7 @@ def preset_tree(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
     base = tree.pop("based_on", None)
     if base is None:
         return tree
-    below = named_file(str(base), CONFIGS, "preset", "presets", path.parent)
+    below = named_file(str(base), CONFIGS, "preset", path.parent)
     return _merged(preset_tree(below, (*derived, path.resolve())), tree)
 
 
@@ -413,15 +413,16 @@ def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def named_file(name: str, folder: Path, one: str, many: str, beside: Path = Path()) -> Path:
+def named_file(name: str, folder: Path, what: str, beside: Path = Path()) -> Path:
     """Return the path of the YAML file of this name in a folder, or else `name` itself as a path, in the folder
-    `beside` or the working directory. Raises InputError, which lists the files of the folder, if there is none."""
+    `beside` or the working directory. what: a word for it. Raises InputError, which lists the files of the folder, if
+    there is none."""
     with suppress(OSError, ValueError):  # of a name that is too long, or holds a NUL
         for path in (folder / f"{name}.yaml", beside / name, Path(name)):
             if path.is_file():
                 return path
     known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
-    raise InputError(f"{name[:80]}: no such {one} or file; {many} are {known}")
+    raise InputError(f"{name[:80]}: no such {what} or file; there are {known}")
 
 
 def title_of(name: str) -> str:

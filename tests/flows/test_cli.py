@@ -53,7 +53,7 @@ from tests.shared_data import shared_capture
             "run http://example.com/x.mp4",
             "hnerf: http://example.com/x.mp4: is no bucket; download it and give the file",
         ),
-        ("run absent --preset best", "best: no such preset or file; presets are "),
+        ("run absent --preset best", "best: no such preset or file; there are "),
         ("run absent --set steps=1", "steps: no such key; it belongs in another section"),
         ("run absent --set training.stepz=1", "training.stepz: no such key; did you mean steps?"),
         ("run absent --set training.noise=.inf", "training.noise: Input should be a finite number"),

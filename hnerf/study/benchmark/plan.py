@@ -138,7 +138,7 @@ class BenchmarkStudy(Section):
 def load_study(name: str) -> BenchmarkStudy:
     """Load a study by its name or its file's path. Raises InputError, in one line, if there is none or a key is not
     allowed."""
-    path = named_file(name, STUDIES, "study", "studies")
+    path = named_file(name, STUDIES, "study")
     study = validated(BenchmarkStudy, read_yaml(path), path)
     for title, variant in study.variants.items():
         for method in variant.methods:

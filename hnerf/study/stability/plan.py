@@ -56,7 +56,7 @@ class StabilityStudy(Section):
 def load_stability(study: str) -> StabilityStudy:
     """Load a study by its name under `configs/stability/` or its file's path. Raises InputError, in one line, if it is
     invalid."""
-    path = named_file(study, STUDIES, "study", "studies")
+    path = named_file(study, STUDIES, "study")
     found = validated(StabilityStudy, read_yaml(path), path)
     for kind, strengths in found.degradations.items():
         try:

@@ -84,7 +84,7 @@ def test_wide_methods_differ_from_small_ones_only_in_their_networks() -> None:
 
 
 def test_unknown_studies_are_refused() -> None:
-    with pytest.raises(InputError, match="speed: no such study or file; studies are cameras, dynamic"):
+    with pytest.raises(InputError, match="speed: no such study or file; there are cameras, dynamic"):
         load_study("speed")
 
 

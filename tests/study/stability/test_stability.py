@@ -80,7 +80,7 @@ def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: 
 
 
 def test_unknown_studies_and_degradations_are_refused() -> None:
-    with pytest.raises(InputError, match="slow: no such study or file; studies are brief, fast, full, methods, "):
+    with pytest.raises(InputError, match="slow: no such study or file; there are brief, fast, full, methods, "):
         load_stability("slow")
     with pytest.raises(InputError, match="--only hats: not in this study; it has cameras_left, "):
         load_stability("quick").restricted_to(["hats"])
