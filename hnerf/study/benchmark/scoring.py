@@ -64,8 +64,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
     protocol = f"{protocol_of(scene.truth)} {SCORING_PROTOCOL}"
     found: Any = {"machine": machine(), "protocol": protocol, "lpips": lpips_availability()}
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
-    scored = scene.capture.test_cameras and split not in unavailable
-    found["curve"] = curve(scene, split, training, avatar, settings, out) if scored else []
+    found["curve"] = curve(scene, training, settings, out)
     for name in SPLITS:
         if name in unavailable:
             found[name] = unscored(unavailable[name])
@@ -87,26 +86,25 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
 
 def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> EndScores:
     """Write `scores.json` with the training's report and only the last point of its curve; return its content."""
-    avatar, split = load_avatar(training), settings.split
-    scored = scene.capture.test_cameras and not reason_unavailable(split, training)
-    rows = curve(scene, split, training, avatar, settings, out) if scored else []
+    rows = curve(scene, training, settings, out)
     found = EndScores(training=json.loads((training / "report.json").read_text()), curve=rows[-1:])
     write_result(out / "scores.json", EndScores, found)
     return found
 
 
-def curve(
-    scene: ScoringScene, split: str, training: Path, finished: Avatar, settings: ScoringSettings, out: Path
-) -> list[CurvePoint]:
-    """Return training seconds and scores of every snapshot and, last, of the finished field, in order of time."""
+def curve(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> list[CurvePoint]:
+    """Return training seconds and scores of every snapshot and, last, of the finished field, in order of time; none if
+    the capture has no test camera or the field nothing to show for the split."""
+    split, rows = settings.split, list[CurvePoint]()
+    if not scene.capture.test_cameras or reason_unavailable(split, training):
+        return rows
     end_s = json.loads((training / "report.json").read_text())["field_seconds"]
     taken = {json.loads((f / "settings.json").read_text())["seconds"]: f for f in (training / "snapshots").glob("*")}
-    models = [(s, load_avatar(taken[s])) for s in sorted(taken) if s < end_s]
-    rows: list[CurvePoint] = []
-    for seconds, avatar in [*models, (end_s, finished)]:
+    models = {s: taken[s] for s in sorted(taken) if s < end_s} | {end_s: training}
+    for seconds, model in models.items():
         folder = out / "snapshots" / f"{seconds:g}"
         folder.mkdir(parents=True)
-        column = avatar_for_split(split, avatar, scene.fitted)
+        column = avatar_for_split(split, load_avatar(model), scene.fitted)
         figures: Any = score_views(scene, column, split, settings.snapshot_images, settings.snapshot_meshes, folder)
         del figures["per_image"]
         rows.append({"seconds": seconds} | figures)
