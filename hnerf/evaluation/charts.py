@@ -19,23 +19,23 @@ Points = list[tuple[float, float]]
 def loss_chart(history: list[dict[str, Any]], path: Path) -> bool:
     """Draw every loss over training time, on a logarithmic scale. Return whether there was one to draw and the file was
     written."""
-    series = _series(history, "losses")
-    positive = {name: [(s, v) for s, v in points if v > 0] for name, points in series.items()}
-    return _chart(path, {k: v for k, v in positive.items() if v}, "seconds of training", "loss", "log")
+    series: dict[str, Points] = defaultdict(list)
+    for record in history:
+        for name, value in record["losses"].items():
+            series[name] += [(record["seconds"], value)] if value > 0 else []
+    return _chart(path, {k: v for k, v in series.items() if v}, "seconds of training", "loss", "log")
 
 
 def quality_chart(history: list[dict[str, Any]], path: Path) -> bool:
-    """Draw held-out scores over training time, one panel each. Return whether there was one to draw and the file was
+    """Draw the PSNR on held-out frames over training time. Return whether there was one to draw and the file was
     written."""
-    series = _series(history, "held_out")
-    if not series:
-        return False
-    figure, panels = _figure(len(series))
-    for axes, colour, (name, points) in zip(panels, COLOURS, series.items(), strict=False):
-        _line(axes, points, colour, None)
-        _finish(axes, "seconds of training", f"held-out {name}")
-    figure.savefig(path, facecolor="white")
-    return True
+    points = [(record["seconds"], record["held_out"]["psnr"]) for record in history if "held_out" in record]
+    if points:
+        figure, axes = _figure()
+        _line(axes, points, COLOURS[0], None)
+        _finish(axes, "seconds of training", "held-out psnr")
+        figure.savefig(path, facecolor="white")
+    return bool(points)
 
 
 def frame_chart(per_image: list[ImageScores], path: Path) -> bool:
@@ -47,19 +47,10 @@ def frame_chart(per_image: list[ImageScores], path: Path) -> bool:
     return _chart(path, series, "frame", "PSNR, dB", "linear")
 
 
-def _series(history: list[dict[str, Any]], key: str) -> dict[str, Points]:
-    """Return, by name, the values under a key of every record, over seconds."""
-    series: dict[str, Points] = defaultdict(list)
-    for record in history:
-        for name, value in record.get(key, {}).items():
-            series[name].append((record["seconds"], value))
-    return series
-
-
 def _chart(path: Path, series: dict[str, Points], x_label: str, y_label: str, scale: str) -> bool:
     if not series:
         return False
-    figure, (axes,) = _figure(1)
+    figure, axes = _figure()
     for k, (name, points) in enumerate(series.items()):
         _line(axes, points, COLOURS[k % len(COLOURS)], name)
     axes.set_yscale(scale)
@@ -69,9 +60,9 @@ def _chart(path: Path, series: dict[str, Points], x_label: str, y_label: str, sc
     return True
 
 
-def _figure(panels: int) -> tuple[Figure, list[Axes]]:
+def _figure() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(9.6, 3.4), dpi=150, layout="constrained")
-    return figure, list(figure.subplots(1, panels, squeeze=False)[0])
+    return figure, figure.subplots()
 
 
 def _line(axes: Axes, points: Points, colour: str, label: str | None) -> None:
