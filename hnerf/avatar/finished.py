@@ -1,6 +1,5 @@
 """Files of a finished run whose digests were not checked, such as those in a copy of a subject's folder."""
 
-import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,11 +7,10 @@ from pathlib import Path
 import cv2
 from safetensors import SafetensorError
 
-from hnerf.avatar.trained import TrainedAvatar, load_avatar
+from hnerf.avatar.trained import TrainedAvatar, load_avatar, stored_settings
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
-from hnerf.config import TrainingSettings
 from hnerf.errors import InputError, one_line
 
 # OpenCV raises SystemError on truncated YAML. Faults of the disk itself (OSError) pass unchanged.
@@ -55,11 +53,10 @@ def avatar_of(subject: Path) -> TrainedAvatar:
 
 def reason_without_novel_poses(training: Path) -> str | None:
     """Return why a trained model, by its folder, cannot show poses that it was not trained on; None if it can."""
-    stored = json.loads((training / "settings.json").read_text())
-    field = TrainingSettings.model_validate(stored["training"]).field
-    if field.kind == "paper" and stored["static"]:
+    settings, static, _ = stored_settings(training)
+    if settings.field.kind == "paper" and static:
         return "H-NeRF's static network models one moment"
-    return field.no_new_poses or None
+    return settings.field.no_new_poses or None
 
 
 def require_poses(subject: Path, what: str) -> None:

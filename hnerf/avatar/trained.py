@@ -145,7 +145,7 @@ def load_avatar(folder: Path, device: torch.device | str | None = None) -> Train
     """Load the subject that training left in `folder`, onto the GPU if there is one and no other device is named.
     Raises InputError if another version wrote it."""
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-    settings, static, gains = _stored_settings(folder / "settings.json")
+    settings, static, gains = stored_settings(folder)
     body = BodyFit.load(folder).to(device)
     path = folder / "model.safetensors"
     tensors = load_file(path, device=str(device))
@@ -157,8 +157,10 @@ def load_avatar(folder: Path, device: torch.device | str | None = None) -> Train
     return TrainedAvatar(field.eval(), body, settings.field.scene_m, body, gains)
 
 
-def _stored_settings(path: Path) -> tuple[config.TrainingSettings, bool, Gains]:
-    """Return the training settings of a subject, whether it had one training frame, and the gains of its cameras."""
+def stored_settings(folder: Path) -> tuple[config.TrainingSettings, bool, Gains]:
+    """Return the settings of the training that wrote `folder`, whether it had one training frame, and the gains of its
+    cameras. Raises InputError if another version wrote them."""
+    path = folder / "settings.json"
     stored = json.loads(path.read_text())
     try:
         gains = {name: tuple(gain) for name, gain in stored.get("gains", {}).items()}

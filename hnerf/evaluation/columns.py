@@ -1,11 +1,11 @@
 """Which avatar each split shows. Novel poses have three columns: animated, posed and tracked, which differ in what was
 tuned on the images of these very frames."""
 
-import json
 from pathlib import Path
 
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.finished import reason_without_novel_poses
+from hnerf.avatar.trained import stored_settings
 from hnerf.body.fit_result import BodyFit
 from hnerf.evaluation.views import ANIMATED, NOVEL_POSE_SPLITS, POSED, TRACKED
 
@@ -28,10 +28,9 @@ def reason_unavailable(split: str, training: Path) -> str | None:
     reason = reason_without_novel_poses(training) if split in NOVEL_POSE_SPLITS else None
     if reason or split not in (POSED, TRACKED):
         return reason
-    settings = json.loads((training / "settings.json").read_text())["training"]
-    steps, nodes = settings["novel_pose_steps"], settings["field"].get("nodes", 0)
-    if split == POSED and not (steps and settings["pose_learning_rate"]):
+    settings, _, _ = stored_settings(training)
+    if split == POSED and not (settings.novel_pose_steps and settings.pose_learning_rate):
         return "no pose of these frames was tuned"
-    if split == TRACKED and not (steps and nodes):
+    if split == TRACKED and not (settings.novel_pose_steps and getattr(settings.field, "nodes", 0)):
         return "these frames have no deformation of their own"
     return None

@@ -9,6 +9,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from hnerf.avatar import trained as model
+from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.avatar.model_file import write_field
 from hnerf.avatar.trained import TrainedAvatar, build_field, load_avatar
 from hnerf.body.fit_result import BodyFit
@@ -39,8 +40,9 @@ def subject(tmp_path: Path) -> Path:
 )
 def test_other_settings_are_refused(subject: Path, stored: dict[str, object]):
     (subject / "settings.json").write_text(json.dumps(stored))
-    with pytest.raises(InputError, match=r"settings\.json: written by another version; train the subject again$"):
-        load_avatar(subject)
+    for read in (load_avatar, reason_without_novel_poses):
+        with pytest.raises(InputError, match=r"settings\.json: written by another version; train the subject again$"):
+            read(subject)
 
 
 def test_a_field_without_its_body_is_refused(subject: Path):
