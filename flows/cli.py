@@ -155,7 +155,7 @@ def _recording(options: argparse.Namespace) -> Path | None:
     else:
         return None
     folder = subject.resolve()
-    noted = Store(folder.parent.parent).recording(folder.name).partition("\n")[2].strip()
+    noted = Store(folder.parent.parent).recording_folder(folder.name)
     return Path(noted) if noted else None
 
 

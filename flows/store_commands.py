@@ -20,14 +20,14 @@ UNITS_S = {"d": 86400, "h": 3600, "m": 60, "s": 1}
 def list_(options: argparse.Namespace) -> None:
     """List the subjects: size, first and latest result, and capture folder."""
     from tasks.garbage import find_garbage
-    from tasks.inventory import NOBODY, Inventory, recording_of
+    from tasks.inventory import NOBODY, Inventory
 
     inventory = Inventory.of(_store(options))
     rows = []
     for subject in sorted(inventory.latest.keys() | {name for names in inventory.owners.values() for name in names}):
         mine = inventory.of_subject(subject)
         if mine:
-            recording = recording_of(inventory.store, subject)
+            recording = inventory.store.recording_folder(subject)
             rows.append((subject, mine, "" if subject in inventory.latest else "no results", recording))
     if nobodys := [inventory.stored[name] for name, names in inventory.owners.items() if not names]:
         rows.append((NOBODY, sorted(nobodys, key=lambda one: one.made_s), "nobody's", ""))
@@ -44,14 +44,14 @@ def list_(options: argparse.Namespace) -> None:
 
 def show(options: argparse.Namespace) -> None:
     """List the artifacts of a subject, and mark the latest."""
-    from tasks.inventory import Inventory, recording_of
+    from tasks.inventory import Inventory
 
     inventory = Inventory.of(_store(options))
     latest = inventory.latest.get(options.name, {})
     mine = inventory.of_subject(options.name)
     if not mine:
         raise InputError(f"{options.name}: no such subject in {options.store}; `hnerf store list` names them")
-    print(f"recording: {printable(recording_of(inventory.store, options.name)) or 'unknown'}")
+    print(f"recording: {printable(inventory.store.recording_folder(options.name)) or 'unknown'}")
     print(f"{'made':<16}  {'used':<16}  {'size':>9} {'files':>6}  latest  artifact")
     for one in mine:
         mark = "yes" if one.artifact.name in latest.values() else ""

@@ -117,11 +117,6 @@ def in_stages(store: Store, pattern: str) -> Iterator[Path]:
             yield from sorted(folder.glob(pattern))
 
 
-def recording_of(store: Store, subject: str) -> str:
-    """Return the folder of the recording from which a subject's results were computed; empty if it is not known."""
-    return " ".join(store.recording(subject).splitlines()[1:])
-
-
 def _latest(store: Store) -> dict[str, dict[str, str]]:
     """Return the names of the artifacts to which each subject's links point."""
     folders = sorted(path for path in (store.root / "subjects").glob("*") if path.is_dir())

@@ -240,6 +240,10 @@ class Store:
         """Return the digest and the folder of a subject's recording, each on a line; empty if they are not known."""
         return _text(self.subject_folder(subject) / RECORDING)
 
+    def recording_folder(self, subject: str) -> str:
+        """Return the folder or URL of the recording that a subject's results come from; empty if it is not known."""
+        return self.recording(subject).partition("\n")[2].strip()
+
     def path(self, stage: str, key: str, suffix: str = "") -> Path:
         """Return the path of an artifact, or of a file that belongs to it (.json, .partial, .lock)."""
         return self.root / stage / f"{key}{suffix}"

@@ -14,7 +14,7 @@ from hnerf.errors import InputError
 from tasks import packed as module
 from tasks.archive import export_subject, import_subject
 from tasks.garbage import collect, find_garbage
-from tasks.inventory import Inventory, recording_of
+from tasks.inventory import Inventory
 from tasks.packed import manifest_name
 from tasks.store import RECORDING, Store
 from tasks.verify import faults
@@ -42,7 +42,7 @@ def test_export_and_import_keep_a_subject_and_all_of_its_inputs(packed: Path, tm
         for name, one in here.stored.items():
             assert one.artifact.digest == there.stored[name].artifact.digest
             assert one.artifact.inputs == there.stored[name].artifact.inputs
-        assert recording_of(store, "ada") == "/recordings/ada"
+        assert store.recording_folder("ada") == "/recordings/ada"
         assert faults(store).lines == []
     assert not list(store.root.glob("*/*.moving"))
 

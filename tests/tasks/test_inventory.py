@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tasks.inventory import Inventory, recording_of
+from tasks.inventory import Inventory
 from tasks.store import Store
 from tests.tasks.stores import LONG_AGO_S, add, names, run_of
 
@@ -81,6 +81,6 @@ def test_the_name_of_a_recording_is_read_only_from_a_regular_file(
 
 
 def test_the_recording_of_a_subject_is_the_path_it_was_read_from(store: Store) -> None:
-    assert recording_of(store, "ada") == ""
+    assert store.recording_folder("ada") == ""
     store.claim("ada", "0123", Path("/recordings/ada"))
-    assert recording_of(store, "ada") == "/recordings/ada"
+    assert store.recording_folder("ada") == "/recordings/ada"
