@@ -17,7 +17,7 @@ from hnerf.evaluation.ground_truth import truth_of
 from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import is_flat, training_limits_s
 from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
-from hnerf.study.benchmark.publish import publish, table_of
+from hnerf.study.benchmark.publish import publish, table_path
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated_capture
 from tasks.capture import ingest
@@ -66,7 +66,7 @@ def benchmark(
         )
     part = plan != whole.restricted_to([], None)
     result, table = empty_result(plan, title_of(study), part, recorded), None
-    artifact_store.claim_table(table_of(result, artifact_store.root), source.digest, source.root)
+    artifact_store.claim_table(table_path(result, artifact_store.root), source.digest, source.root)
     for title, entry in result["variants"].items():
         variant = plan.variants[title]
         for name in () if "left_out" in entry else variant.methods or plan.methods:

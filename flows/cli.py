@@ -18,7 +18,7 @@ from hnerf.config import load_settings
 from hnerf.errors import DISK_FULL, REASON, UNREACHABLE, InputError, InvalidAsset
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
-from tasks.source import place
+from tasks.source import path_or_url
 from tasks.store import NAME, Store
 
 FAILED, BAD_INPUT, INTERRUPTED, ENDED = 1, 2, 130, 128  # as in shells: 128 plus the signal's number
@@ -181,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
         return added
 
     run = add(commands.run, store, preset)
-    run.add_argument("capture", type=place, help="capture folder, its URL in a bucket, or one video")
+    run.add_argument("capture", type=path_or_url, help="capture folder, its URL in a bucket, or one video")
     _add_overrides(run, "override a setting; `hnerf settings` lists all")
     add(commands.check_cameras, capture, preset)
     add(commands.settings, preset)

@@ -23,7 +23,7 @@ from tasks import quarantine
 from tasks.bucket import is_visible
 from tasks.ledger import Ledger
 from tasks.remote import remote_captures
-from tasks.source import entries, place, read_capture
+from tasks.source import entries, path_or_url, read_capture
 
 DISK_EVENT = "hnerf.disk.nearly-full"  # flows/automations.py notifies the operator
 
@@ -57,14 +57,14 @@ def ingest_captures(
         min_free_gib: Start nothing while the store's disk has less free space than this, in GiB.
     """
     ledger = Ledger.of(store)
-    folder = place(folder)
+    folder = path_or_url(folder)
     if isinstance(folder, Path):
         folder.mkdir(parents=True, exist_ok=True)
         quarantine.clear_removed(folder)
     if not _has_room(store, min_free_gib):
         return []
     for lost, why in restart_crashed(max_restarts):
-        capture = place(lost.parameters["capture"])
+        capture = path_or_url(lost.parameters["capture"])
         quarantine.note_run(capture, store, f"failed: {why} (flow run {lost.name}, {lost.id})")
     load_settings(preset)  # a misspelled one would use up every capture: failed runs are not started again
     started: list[str] = []

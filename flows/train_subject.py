@@ -28,7 +28,7 @@ from tasks.limits import set_limits
 from tasks.quarantine import clear, note_run
 from tasks.quiet import EXPECTED
 from tasks.remote import fetched, remote_capture
-from tasks.source import NothingThereError, place, read_capture
+from tasks.source import NothingThereError, path_or_url, read_capture
 from tasks.stage import retried
 from tasks.store import OPTIONAL, Artifact, Store
 from tasks.training import train
@@ -69,7 +69,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     settings = load_settings(preset, overrides)
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
-    capture = place(capture)
+    capture = path_or_url(capture)
     try:
         source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
     except NothingThereError:  # so that it may be started again from wherever it is now
@@ -122,7 +122,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
 @train_subject.on_failure
 def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Write the reason into the watched folder, if the capture was started from there."""
-    capture, store = place(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
+    capture, store = path_or_url(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
     error = state.result(raise_on_failure=False)
     if isinstance(error, Exception):
         kind = "refused" if isinstance(error, InputError) else "failed"
@@ -133,7 +133,7 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
 @train_subject.on_completion
 def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Remove the note of an earlier run."""
-    capture = place(flow_run.parameters["capture"])
+    capture = path_or_url(flow_run.parameters["capture"])
     if isinstance(capture, Path):
         with suppress(OSError):
             clear(capture)

@@ -19,7 +19,7 @@ class NothingThereError(InputError):
     """There is no file at a path or URL."""
 
 
-def place(given: Path | str) -> Path | str:
+def path_or_url(given: Path | str) -> Path | str:
     """Return a path, or the URL of something in a bucket. file:// URLs become paths. Raises InputError for an empty
     text, which as a path would be the current folder."""
     text = str(given).removeprefix("file://")

@@ -7,7 +7,7 @@ import pytest
 
 from hnerf.errors import InputError
 from tasks import source as module
-from tasks.source import place, read_capture, require_unchanged
+from tasks.source import path_or_url, read_capture, require_unchanged
 
 
 @pytest.fixture
@@ -187,6 +187,6 @@ def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
 
 def test_a_local_place_is_a_path_and_a_remote_one_a_url() -> None:
     given = ("s3://b/ada", "file:///ada", "ada", Path("ada"))
-    assert [place(one) for one in given] == ["s3://b/ada", Path("/ada"), Path("ada"), Path("ada")]
+    assert [path_or_url(one) for one in given] == ["s3://b/ada", Path("/ada"), Path("ada"), Path("ada")]
     with pytest.raises(InputError, match="empty"):
-        place("")
+        path_or_url("")

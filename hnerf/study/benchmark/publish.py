@@ -21,14 +21,14 @@ TRAINING_DISTANCE_PANELS = (  # distance, split, score, labels of the distance a
 SWEEP_FIGURES = {"psnr": PSNR, "geometry.chamfer_l2_e3": f"{CHAMFER}, 1e-3 m²"}
 
 
-def table_of(result: Mapping[str, Any], store: Path) -> Path:
+def table_path(result: Mapping[str, Any], store: Path) -> Path:
     """Return `<store>/benchmark/<subject>-<study>.md`; the study's name ends in "-part" if only part of it was run."""
     return store / "benchmark" / f"{result['subject']}-{result['study']}{'-part' if result['part'] else ''}.md"
 
 
 def publish(result: dict[str, Any], store: Path) -> Path:
     """Write a result's table, with CSV and JSON next to it, and redraw its PNGs; return the table's path."""
-    table = table_of(result, store)
+    table = table_path(result, store)
     table.parent.mkdir(parents=True, exist_ok=True)
     drawn = draw_charts(result, store, table)
     replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
