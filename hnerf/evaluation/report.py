@@ -31,29 +31,17 @@ from hnerf.evaluation.views import (
     sample_views,
 )
 from hnerf.files import png_data_uri
-from hnerf.results import HeldOutCamera, Mean, Metrics, Split
+from hnerf.results import HeldOutCamera, Metrics, Split
 from hnerf.tables import pick, shown
 
 FIGURES = (  # key in a split's scores, name, unit, format, meaning
-    (
-        "psnr",
-        "PSNR",
-        "dB",
-        "{:.2f}",
-        "Pixel error, logarithmic. Higher is better; 3 dB more is half the squared error.",
-    ),
+    ("psnr", "PSNR", "dB", "{:.2f}", "Logarithmic pixel error. Higher is better; 3 dB more is half the squared error."),
     ("ssim", "SSIM", "", "{:.3f}", "Similarity of local structure: edges, folds, patterns. 1 is identical."),
     ("mask_iou", "Mask IoU", "", "{:.3f}", "Overlap of the rendered person and the true mask. 1 is identical."),
     ("lpips", "LPIPS", "", "{:.3f}", "Difference by a network trained on human judgement. 0 is identical."),
     ("geometry.chamfer_mm", "Surface distance", "mm", "{:.1f}", "Mean distance between the surface and the true one."),
     ("geometry.chamfer_l2_e3", "Chamfer", "m² × 10⁻³", "{:.3f}", "Mean squared distance; larger errors weigh more."),
-    (
-        "geometry.normal_consistency",
-        "Normal consistency",
-        "",
-        "{:.3f}",
-        "Agreement of surface normals. 1 is identical.",
-    ),
+    ("geometry.normal_consistency", "Normal consistency", "", "{:.3f}", "Agreement of the normals. 1 is identical."),
     ("geometry.iou", "Volume IoU", "", "{:.3f}", "Overlap of the volumes. 1 is identical."),
 )
 SPLIT_TITLES: dict[Split, str] = {
@@ -159,7 +147,7 @@ def held_out_rows(found: Metrics) -> list[list[str]]:
     """Return the cells of a table: a row for each held-out camera, and their mean."""
     if found["holdout"] is None:
         return []
-    forms: dict[Mean, str] = {"psnr": "{:.2f}", "ssim": "{:.3f}", "mask_iou": "{:.3f}", "lpips": "{:.3f}"}
+    forms = {key: form for key, _, _, form, _ in FIGURES if not key.startswith("geometry.")}
     scores: dict[str, Any] = {f"Camera {name}": by_split for name, by_split in found["holdout"]["cameras"].items()}
     return [
         [name, *(shown(by_split[split][key], form) for split in PRIMARY_SPLITS for key, form in forms.items())]
