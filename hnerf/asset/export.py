@@ -170,14 +170,15 @@ def _mesh_asset(
     timeless = avatar.without_frames()  # one texture serves all frames
     with timed("correctives", seconds, log):
         surface = _clothed_surface(capture, avatar, meshes.by_topology[topology], settings)
-    layout = surface.mesh.layout(settings.texture_px)
+    mesh = surface.mesh
+    layout = mesh.layout(settings.texture_px)
     with timed("texture", seconds, log):
         texture, albedo = baked_textures(
-            capture, timeless, surface.body, surface.surfaces_m, layout, settings, surface.mesh.cavities
+            capture, timeless, surface.body, surface.surfaces_m, layout, settings, mesh.cavities
         )
     with timed("normal map", seconds, log):
         px = settings.normal_map_px
-        normals = normal_map(timeless, surface.mesh, layout, px) if px else None
+        normals = normal_map(timeless, mesh, layout, px) if px else None
     with timed("staging", seconds, log):
         staged = stage_avatar(
             surface.body,
@@ -187,13 +188,13 @@ def _mesh_asset(
             texture,
             capture.up,
             capture.fps,
-            settings.bones,
-            {name: (dataclasses.replace(body, rig=surface.mesh.rig), fps) for name, (body, fps) in added.items()},
-            albedo,
-            normals,
-            settings.level_faces,
-            surface.mesh.face_units_m,
-            surface.mesh.physiques_m,
+            bones=settings.bones,
+            further={name: (dataclasses.replace(body, rig=mesh.rig), fps) for name, (body, fps) in added.items()},
+            albedo=albedo,
+            normal_map=normals,
+            level_faces=settings.level_faces,
+            expressions_m=mesh.face_units_m,
+            physiques_m=mesh.physiques_m,
         )
     splats = surface_splats(staged, settings.splats) if settings.splats else None
     with timed("comparison", seconds, log):
