@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from hnerf.asset.motions import Y_UP_FROM_Z_UP, motion_of
+from hnerf.asset.motions import motion_of
 from hnerf.asset.registration import crossing_faces
 from hnerf.asset.rigs import FULL, posed_frames
 from hnerf.asset.skinning import skinned
@@ -18,6 +18,7 @@ from hnerf.body.fingers import LIMITS_DEG, FingerPrior
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.hand_points import finger_joints
 from hnerf.body.rig import Rig
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
 # Joint rotations from the A pose, in degrees: about X (to the left), then Y (up), then Z (to the front). The right side
 # mirrors the left. They are near the limits of human motion.
