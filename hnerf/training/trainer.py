@@ -306,12 +306,8 @@ class Trainer:
         bodies = self.scene.bodies
         BodyFit(bodies.rig, self.body.frames, bodies.theta, bodies.root).to("cpu").save(folder)
         write_field(self.field, folder / "model.safetensors")
-        decisions = {name: dataclasses.asdict(decision) for name, decision in self.decisions.items()}
-        settings: dict[str, Any] = {
-            "static": self.static,
-            "training": self.settings.model_dump(),
-            "decisions": decisions,
-        }
+        settings: dict[str, Any] = {"static": self.static, "training": self.settings.model_dump()}
+        settings["decisions"] = {name: dataclasses.asdict(decision) for name, decision in self.decisions.items()}
         settings |= {"gains": self.gains, "seconds": self.seconds}
         (folder / "settings.json").write_text(json.dumps(settings, indent=1))
 
