@@ -69,13 +69,13 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     available = [split for split in (TRAINING_VIEW, *SPLITS) if split not in unavailable]
     avatars = {split: avatar_for_split(split, inputs.avatar, inputs.fitted) for split in available}
     shown = [sample_views(all_views(capture, split), settings.report_rows) for split in available]
-    views = {split: scored_views(capture, split, truth, settings.max_images) for split in available if split in SPLITS}
+    views = {split: scored_views(split, truth, settings.max_images) for split in available if split in SPLITS}
     illustrative = (POSED, TRACKED) if not capture.test_cameras else ()  # only those that the report shows
     wanted = dict.fromkeys(itertools.chain(*shown, *(views[split] for split in views if split not in illustrative)))
     image_seconds = render(avatars, capture, list(wanted), out)
     rendered = time.perf_counter()
     found: Any = {"protocol": protocol_of(truth), "lpips": lpips_availability(), "seconds_per_image": image_seconds}
-    found |= {split: score_split(capture, split, views[split], truth, out) for split in views}
+    found |= {split: score_split(split, views[split], truth, out) for split in views}
     found |= {split: unscored(why) for split, why in unavailable.items()}
     true_meshes = truth.meshes()
     for split in PRIMARY_SPLITS:

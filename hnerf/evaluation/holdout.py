@@ -67,10 +67,10 @@ def score_held_out(
     found: Any = {"camera": camera, "trained_on": list(others)}
     for split in PRIMARY_SPLITS:
         why = reason_unavailable(split, training)
-        views = [] if why else scored_views(seen, split, truth, settings.max_images)
+        views = [] if why else scored_views(split, truth, settings.max_images)
         if views:
             render({split: avatar_for_split(split, avatar, fitted)}, seen, views, out)
-        found[split] = unscored(why) if why else score_split(seen, split, views, truth, out)
+        found[split] = unscored(why) if why else score_split(split, views, truth, out)
     write_result(out / SCORES_FILE, HeldOutCamera, found)
     return found
 

@@ -24,9 +24,9 @@ TUNED_ON = (
 )
 
 
-def scored_views(capture: Capture, split: str, truth: Truth, count: int | None) -> list[View]:
+def scored_views(split: str, truth: Truth, count: int | None) -> list[View]:
     """Return all images of a split, or at most `count` of those with a true mask (of all, if none has one)."""
-    views = all_views(capture, split)
+    views = all_views(truth.capture, split)
     if count is None:
         return views
     return sample_views(views_with_mask(views, truth) or views, count)
@@ -60,13 +60,13 @@ def rgba(rendering: Rendering) -> np.ndarray:
     return (both.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
-def score_split(capture: Capture, split: str, views: list[View], truth: Truth, out: Path) -> SplitScores:
+def score_split(split: str, views: list[View], truth: Truth, out: Path) -> SplitScores:
     """Return the mean image scores of a split's renderings, and those of each image; null with a reason if there are
     none."""
     if not views:
         missing = "novel-pose frames" if split in NOVEL_POSE_SPLITS else "test cameras"
         return unscored(f"the capture has no {missing}")
-    if not capture.test_cameras:
+    if not truth.capture.test_cameras:
         return unscored(TUNED_ON)
     if not truth.has_masks:
         return unscored("the test cameras have neither ground-truth masks nor masks that came with the recording")

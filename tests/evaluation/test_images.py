@@ -46,7 +46,7 @@ def test_images_without_the_person_are_counted_but_not_scored(tmp_path: Path) ->
     write_image(tmp_path / "ground_truth" / "masks" / "c" / "000001.png", np.zeros((64, 64, 3), np.uint8))
     views = [View("novel_view", "c", frame) for frame in (0, 1)]
     render({"novel_view": BallAvatar(ball_fit())}, capture, views, tmp_path)
-    found = score_split(capture, "novel_view", views, GroundTruth(tmp_path, capture), tmp_path)
+    found = score_split("novel_view", views, GroundTruth(tmp_path, capture), tmp_path)
     assert (found["n"], found["without_person"], found["without_mask"]) == (1, 1, 0)
     assert [row["frame"] for row in found["per_image"]] == [0]
 

@@ -121,7 +121,7 @@ def score_views(
     views = evenly_spaced(views_with_mask(views, scene.truth) or views, images or len(views))
     if views and scene.capture.test_cameras:
         render({split: avatar}, scene.capture, views, out)
-    found: Any = score_split(scene.capture, split, views, scene.truth, out)
+    found: Any = score_split(split, views, scene.truth, out)
     if split not in PRIMARY_SPLITS:
         return found
     if not meshes:
