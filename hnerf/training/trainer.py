@@ -139,15 +139,15 @@ class Trainer:
                 self.field_seconds = self.seconds
             if self.processes.is_main:
                 self._report_progress()
-            snapshot_due = bool(snapshots_s) and self.seconds >= snapshots_s[0]
+            due_s = [s for s in snapshots_s if s <= self.seconds]
             checkpoint_due = self.step % self.settings.checkpoint_steps == 0 or self.step == self.steps
             absorb_due = self.step % self.settings.absorb_steps == 0 or self.step in (self.field_steps, self.steps)
-            if absorb_due or snapshot_due or checkpoint_due:  # a resumed training finds the same bodies
+            if absorb_due or due_s or checkpoint_due:  # a resumed training finds the same bodies
                 self._absorb()
-            if snapshot_due:
-                if self.processes.is_main:
-                    self._save(self._snapshot(snapshots_s[0]))
-                snapshots_s.pop(0)
+            if due_s:
+                for s in due_s if self.processes.is_main else ():
+                    self._save(self._snapshot(s))
+                snapshots_s = snapshots_s[len(due_s) :]
                 self.processes.barrier()
                 started = time.monotonic() - self.seconds  # writing snapshots does not count
             if self.step % LOG_STEPS == 0 or self.step in (1, self.field_steps, self.steps):
