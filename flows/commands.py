@@ -100,16 +100,13 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
 
 def calibrate(options: argparse.Namespace) -> None:
     """Calibrate cameras from footage of a board, or from the person."""
-    other, its = ("boards", ("ground_frame",)) if options.source == "person" else ("person", ("height", "lens", "fov"))
-    for name in its:
-        if getattr(options, name) is not None:
-            option = f"--{name.replace('_', '-')}"
-            raise InputError(
-                f"{option}: has no effect with --from {options.source}; leave it out, or give --from {other}"
-            )
-    source = _calibrate_from_person if options.source == "person" else _calibrate_from_boards
+    for name, source in {"ground_frame": "boards", "height": "person", "lens": "person", "fov": "person"}.items():
+        if source != options.source and getattr(options, name) is not None:
+            why = f"has no effect with --from {options.source}; leave it out, or give --from {source}"
+            raise InputError(f"--{name.replace('_', '-')}: {why}")
+    read = _calibrate_from_person if options.source == "person" else _calibrate_from_boards
     with atomic_folder(options.out) as partial:
-        _read_in_cage(source, options, partial)
+        _read_in_cage(read, options, partial)
 
 
 def _calibrate_from_boards(options: argparse.Namespace, out: Path) -> None:
