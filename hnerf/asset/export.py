@@ -104,11 +104,11 @@ def export_asset(
         for name, motion in (further or {}).items()
     }
     meshes = _rest_meshes(avatar, settings, seconds)
-    names = list(meshes.by_topology) if settings.topology == "both" else [settings.topology]
-    asset = _mesh_asset(capture, masks, avatar, meshes, names[0], settings, added)
-    bare = settings.model_copy(update={"splats": 0})  # the first mesh alone has splats
-    others = [_mesh_asset(capture, masks, avatar, meshes, name, bare, added) for name in names[1:]]
-    captured = others[0] if others else None
+    topology = "registered" if settings.topology == "both" else settings.topology
+    asset, captured = _mesh_asset(capture, masks, avatar, meshes, topology, settings, added), None
+    if settings.topology == "both":
+        bare = settings.model_copy(update={"splats": 0})  # the first mesh alone has splats
+        captured = _mesh_asset(capture, masks, avatar, meshes, "captured", bare, added)
     surface, staged, splats = asset.surface, asset.staged, asset.splats
     seconds |= asset.seconds
     with timed("poses", seconds, log):
@@ -123,7 +123,7 @@ def export_asset(
         resampled = [f"avatar_{rate}.usda" for rate in staged.rates]
         packages = ["avatar.usdz", "avatar.usda", *resampled, "avatar_cache.usdz", *([SPLATS] if splats else [])]
         validation = {name: validate_package(out / name) for name in packages}
-    report = _figures(capture, meshes, asset, names[0], settings) | {
+    report = _figures(capture, meshes, asset, topology, settings) | {
         "against_field": asset.against_field,
         "crossing_share": {pose.name: pose.crossing for pose in poses},
         "viewer": viewer,
