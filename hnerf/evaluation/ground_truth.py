@@ -26,8 +26,8 @@ UNDER_GIVEN_MASKS = "photographs under the masks that came with the recording, w
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The Truth of an original capture folder's `ground_truth/`; images are those of the recorded frame nearest in
-    time, as in the capture, at the size of its camera."""
+    """The ground truth in an original capture folder, under `ground_truth/`. Images are those of the recorded frame
+    nearest in time, as in the capture, at the size of its camera."""
 
     folder: Path
     capture: Capture
@@ -105,8 +105,8 @@ class GroundTruth:
 
 
 class GivenMasks(GroundTruth):
-    """The Truth of captures whose test cameras have no true masks, but masks that came with the recording: photographs
-    under those masks, with everybody they show. Surfaces are still those of `ground_truth/`."""
+    """What stands in for the ground truth if the test cameras have no true masks, but masks that came with the
+    recording: photographs under those masks, with everybody they show. Surfaces are still those of `ground_truth/`."""
 
     def has_mask(self, camera: str, frame: int) -> bool:
         """Return whether a mask of this image came with the recording."""
@@ -132,7 +132,7 @@ def truth_of(folder: Path, capture: Capture) -> GroundTruth:
 
 @dataclass(frozen=True)
 class OwnMasks:
-    """The Truth of captures without ground truth: the person under the masks from segmentation."""
+    """What stands in for ground truth in captures without any: the person under the masks from segmentation."""
 
     capture: Capture
     masks: Masks

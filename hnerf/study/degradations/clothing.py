@@ -135,7 +135,7 @@ def long_hair(keypoints_m: np.ndarray, up: np.ndarray, length_m: float, rng: Rng
 
 
 def add_clothing(
-    sewn: Callable[[np.ndarray, np.ndarray, float, Rng], Garment],
+    sew: Callable[[np.ndarray, np.ndarray, float, Rng], Garment],
     capture: Capture,
     body: BodyFit,
     truth: GroundTruth,
@@ -143,13 +143,13 @@ def add_clothing(
     rng: Rng,
     out: Path,
 ) -> None:
-    """Write the capture into `out` with a garment, `skirt` or `long_hair`, drawn into every image and mask, and into
-    the ground truth under `ground_truth/`. Keypoints stay, since detectors guess what cloth hides. Board footage is
-    omitted."""
+    """Write the capture into `out` with a garment drawn into every image and mask, and into the ground truth under
+    `ground_truth/`. sew: `skirt` or `long_hair`. Keypoints stay, since detectors guess what cloth hides. Board footage
+    is omitted."""
     bodies_m, faces = body.vertices_m().double().numpy(), body.rig.faces.numpy()
     rows = [body.index(frame) for frame in capture.frames]
     keypoints_m = body.rig.keypoint_weights.double().numpy() @ bodies_m[rows]
-    garment = sewn(keypoints_m, np.eye(3)["xyz".index(capture.up)], strength, rng)
+    garment = sew(keypoints_m, np.eye(3)["xyz".index(capture.up)], strength, rng)
     kept = dataclasses.replace(capture, root=out, frame_offsets={}, stored_frames=(), recorded_lenses={})
     write_arrays(capture, kept)
     (out / BOARDS_FILE).unlink(missing_ok=True)
