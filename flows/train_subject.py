@@ -3,13 +3,14 @@
 import logging
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from prefect import flow
 from prefect.client.schemas.objects import FlowRun, State
 
-from flows.preparation import segment_and_fit, segment_subject, with_detections
+from flows.preparation import Prepared, segment_and_fit, segment_subject, with_detections
 from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
@@ -80,28 +81,23 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     held_out_cameras(normalised.train_cameras, normalised.test_cameras, settings.evaluation.holdout)
     subject = normalised.name
     artifact_store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
-    artifact_store.link_latest(subject, recorded)
+    link = partial(artifact_store.link_latest, subject)
+    link(recorded)
     recording = with_detections(artifact_store, recorded, settings)
     artifact_store.unlink_latest(subject, OPTIONAL - {recording.stage})
-    artifact_store.link_latest(subject, recording)
-    calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
+    link(recording)
+    calibration = link(calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
-    segmentation = artifact_store.link_latest(
-        subject, segment_subject(artifact_store, recording, calibration, settings)
-    )
-    body = artifact_store.link_latest(subject, fit(artifact_store, recording, calibration, segmentation, settings.fit))
-    training = artifact_store.link_latest(
-        subject, train(artifact_store, recording, calibration, segmentation, body, settings.training)
-    )
+    segmentation = link(segment_subject(artifact_store, recording, calibration, settings))
+    body = link(fit(artifact_store, recording, calibration, segmentation, settings.fit))
+    prepared = Prepared(recording, calibration, segmentation, body)
+    training = link(train(artifact_store, *prepared, settings.training))
     held_out = tuple(
         evaluate_without_camera(camera, artifact_store, recording, calibration, segmentation, settings)
         for camera in left_out
     )
-    evaluation = evaluate(
-        artifact_store, truth, recording, calibration, segmentation, body, training, settings.evaluation, held_out
-    )
-    artifact_store.link_latest(subject, evaluation)
-    results, asset = [recorded, recording, calibration, segmentation, body, training, evaluation], None
+    evaluation = link(evaluate(artifact_store, truth, *prepared, training, settings.evaluation, held_out))
+    results, asset = [recorded, *prepared, training, evaluation], None
     if reason := reason_without_novel_poses(training.root):
         log.warning("no asset: %s", reason)
     else:
@@ -110,7 +106,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     # Again: another run of this name may have relinked them.
     artifact_store.unlink_latest(subject, OPTIONAL - {recording.stage})
     for artifact in results:
-        artifact_store.link_latest(subject, artifact)
+        link(artifact)
     trained = Trained(artifact_store.subject_folder(subject), evaluation.root / "report.html", asset)
     pictures = embedded(_key_pictures(calibration, evaluation))
     page = f"{_figures(subject, evaluation, training, trained)}\n\n{pictures}\n"
