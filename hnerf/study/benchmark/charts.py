@@ -26,6 +26,8 @@ CHARACTERS_PER_INCH = 13
 Curves = Mapping[str, Sequence[Point]]
 Style = dict[str, Any]
 NO_REASONS: Mapping[str, str] = {}
+CLOUD: Style = {"linestyle": "none", "markersize": 3.5, "alpha": 0.35, "markeredgewidth": 0}
+FRONT: Style = {"color": INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "zorder": 1, "scalex": False, "scaley": False}
 
 
 @dataclass(frozen=True)
@@ -113,13 +115,7 @@ def training_distance_chart(
         edges = bin_edges(clouds.values(), bins)
         means = {name: bin_means(points, edges) for name, points in clouds.items()}
         for name, points in clouds.items():
-            method_style = method_styles[name] | {
-                "linestyle": "none",
-                "markersize": 3.5,
-                "alpha": 0.35,
-                "markeredgewidth": 0,
-            }
-            panel.plot(*zip(*points, strict=True), **method_style)
+            panel.plot(*zip(*points, strict=True), **method_styles[name] | CLOUD)
         lines = {name: [(x, y) for x, y, _ in found.values()] for name, found in means.items()}
         draw_curves(panel, lines, method_styles)
         for x, _, count in max(means.values(), key=len).values():
@@ -172,17 +168,7 @@ def draw_pareto_front(axes: Axes, points: Mapping[str, Point], method_styles: Ma
     (_, right), (bottom, _) = axes.get_xlim(), axes.get_ylim()
     best = [points[name] for name in pareto_front(points)]
     corners = [(best[0][0], bottom), *best, (right, best[-1][1])]
-    axes.plot(
-        *zip(*corners, strict=True),
-        color=INK,
-        linewidth=1.0,
-        linestyle=(0, (4, 3)),
-        zorder=1,
-        drawstyle="steps-post",
-        label="Pareto front",
-        scalex=False,
-        scaley=False,
-    )
+    axes.plot(*zip(*corners, strict=True), label="Pareto front", drawstyle="steps-post", **FRONT)
     _label_points(points, axes, method_styles, LABEL_LIFT_PT)
     axes.legend(loc="best", frameon=False, fontsize=8, labelcolor=INK)
 

@@ -102,13 +102,5 @@ def _curve(
     axes.plot(x, means, linewidth=1.6, markersize=4, label=runs[0]["method"] if runs else None, **method_style)
     axes.fill_between(x, lows, highs, color=method_style["color"], alpha=0.2, linewidth=0)
     gone = [place for place, found in enumerate(by_place) if len(found) > len(values[place])]
-    bottom = axes.get_xaxis_transform()
-    axes.plot(
-        [x + 0.15 * k for x in gone],
-        [0.04] * len(gone),
-        "x",
-        color=method_style["color"],
-        markersize=7,
-        markeredgewidth=2,
-        transform=bottom,
-    )
+    cross: Style = {"color": method_style["color"], "markersize": 7, "markeredgewidth": 2}
+    axes.plot([x + 0.15 * k for x in gone], [0.04] * len(gone), "x", transform=axes.get_xaxis_transform(), **cross)
