@@ -69,28 +69,25 @@ def write_report(
 ) -> None:
     """Write `report.html` and its charts into `out`, from the renderings and meshes there and the stages' reports."""
     stages = stage_reports(inputs)
-    page = (
-        report_environment()
-        .get_template("report.html")
-        .render(
-            capture=inputs.capture,
-            size_px=image_sizes(inputs),
-            split_titles=SPLIT_TITLES,
-            columns=COLUMNS,
-            reasons=[*missing_figures(found), *under_given_masks(found)],
-            held_out=held_out_rows(found),
-            found=found,
-            summary=summary(found),
-            galleries=galleries(inputs, settings, truth, true_meshes, found, out),
-            training_charts=training_charts(inputs.training_folder / "history.jsonl", out),
-            frame_charts=frame_charts(found, out),
-            people_picture=png_uri(inputs.capture.root / PICTURE),
-            rig_picture=png_uri(inputs.calibration_folder / "cameras.png"),
-            evidence_picture=png_uri(inputs.calibration_folder / "witnesses.png"),
-            stages=stages,
-            costs=costs(stages, found),
-            notes=reading_notes(inputs, found),
-        )
+    template = report_environment().get_template("report.html")
+    page = template.render(
+        capture=inputs.capture,
+        size_px=image_sizes(inputs),
+        split_titles=SPLIT_TITLES,
+        columns=COLUMNS,
+        reasons=[*missing_figures(found), *under_given_masks(found)],
+        held_out=held_out_rows(found),
+        found=found,
+        summary=summary(found),
+        galleries=galleries(inputs, settings, truth, true_meshes, found, out),
+        training_charts=training_charts(inputs.training_folder / "history.jsonl", out),
+        frame_charts=frame_charts(found, out),
+        people_picture=png_uri(inputs.capture.root / PICTURE),
+        rig_picture=png_uri(inputs.calibration_folder / "cameras.png"),
+        evidence_picture=png_uri(inputs.calibration_folder / "witnesses.png"),
+        stages=stages,
+        costs=costs(stages, found),
+        notes=reading_notes(inputs, found),
     )
     (out / "report.html").write_text(page, encoding="utf-8")
 
