@@ -2,6 +2,7 @@
 Synthesis of Dynamic Humans, CVPR 2021)."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -94,14 +95,8 @@ class NeuralBodyField(DynamicField):
         width, features = settings.width, settings.channels * (LEVELS - 1)
         self.vertex_codes = nn.Parameter(INITIAL_CODE_STD * torch.randn(len(body.rig.vertices_m), settings.code_width))
         self.diffusion = Diffusion(settings.code_width, settings.channels)
-        self.trunk = nn.Sequential(
-            nn.Linear(features, width),
-            nn.SiLU(),
-            nn.Linear(width, width),
-            nn.SiLU(),
-            nn.Linear(width, width),
-            nn.SiLU(),
-        )
+        sizes = [features, width, width, width]
+        self.trunk = nn.Sequential(*(m for a, b in pairwise(sizes) for m in (nn.Linear(a, b), nn.SiLU())))
         self.density = nn.Linear(width, 1)
         encoded = 3 * (2 + 2 * (POSITION_OCTAVES + VIEW_OCTAVES))
         self.radiance = nn.Sequential(
