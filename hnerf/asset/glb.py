@@ -2,6 +2,7 @@
 Group)."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -41,18 +42,8 @@ class GlbWriter:
 
     def accessor(self, values: np.ndarray, target: int | None = None) -> int:
         """Append an array whose first axis counts the elements; return the index of the accessor."""
-        flat = values.reshape(len(values), -1)
-        self.document.accessors.append(
-            gltf.Accessor(
-                bufferView=self.view(np.ascontiguousarray(values).tobytes(), target),
-                componentType=COMPONENT_TYPES[values.dtype.name],
-                count=len(values),
-                type=SHAPES[values.shape[1:]],
-                min=flat.min(0).tolist(),
-                max=flat.max(0).tolist(),
-            )
-        )
-        return len(self.document.accessors) - 1
+        flat, view = values.reshape(len(values), -1), self.view(np.ascontiguousarray(values).tobytes(), target)
+        return self._add(values, len(values), flat.min(0), flat.max(0), bufferView=view)
 
     def sparse_accessor(self, values: np.ndarray, at: int, count: int) -> int:
         """Append an array of `count` elements that are zero except for n < count float32 values (n, C); return the
@@ -62,17 +53,14 @@ class GlbWriter:
             indices=gltf.AccessorSparseIndices(bufferView=at, componentType=gltf.UNSIGNED_INT),
             values=gltf.AccessorSparseValues(bufferView=self.view(np.ascontiguousarray(values).tobytes())),
         )
-        self.document.accessors.append(
-            gltf.Accessor(
-                byteOffset=None,
-                componentType=gltf.FLOAT,
-                count=count,
-                type=SHAPES[values.shape[1:]],
-                min=np.minimum(values.min(0), 0).tolist(),
-                max=np.maximum(values.max(0), 0).tolist(),
-                sparse=sparse,
-            )
-        )
+        low, high = np.minimum(values.min(0), 0), np.maximum(values.max(0), 0)
+        return self._add(values, count, low, high, byteOffset=None, sparse=sparse)
+
+    def _add(self, values: np.ndarray, count: int, low: np.ndarray, high: np.ndarray, **content: Any) -> int:
+        """Append an accessor of `count` elements like those of `values`, from low to high; return its index."""
+        kind = {"componentType": COMPONENT_TYPES[values.dtype.name], "type": SHAPES[values.shape[1:]]}
+        limits = {"min": low.tolist(), "max": high.tolist()}
+        self.document.accessors.append(gltf.Accessor(count=count, **kind, **limits, **content))
         return len(self.document.accessors) - 1
 
     def save(self, path: Path) -> None:
