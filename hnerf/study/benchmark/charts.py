@@ -40,9 +40,6 @@ class SpeedRow:
     points: Mapping[str, Point]
     trivial_psnr: Mapping[str, float]
 
-    def __bool__(self) -> bool:
-        return bool(self.curves or self.points)
-
 
 def styles(methods: Iterable[str]) -> dict[str, Style]:
     """Return a plot style for each method, the same in every chart of a study."""

@@ -42,16 +42,13 @@ def draw_charts(result: Mapping[str, Any], store: Path, table: Path) -> list[Pat
     method_styles, caption, variants = charts.styles(result["methods"]), results.caption(result), result["variants"]
     paths = {name: table.with_name(f"{table.stem}{name}.png") for name in ("", "-sweep", "-nearness", "-pictures")}
     drawn = []
-    panels = {
-        title: charts.SpeedRow(
-            results.psnr_curves(variant),
-            results.end_reasons(variant),
-            results.frame_points(variant),
-            results.trivial_psnr(variant),
-        )
-        for title, variant in variants.items()
-    }
-    if rows := {results.heading(title, variants[title]): row for title, row in panels.items() if row}:
+    rows = {}
+    for title, variant in variants.items():
+        curves, points = results.psnr_curves(variant), results.frame_points(variant)
+        if curves or points:
+            ends, trivial = results.end_reasons(variant), results.trivial_psnr(variant)
+            rows[results.heading(title, variant)] = charts.SpeedRow(curves, ends, points, trivial)
+    if rows:
         frame = f"time of a frame of {results.smallest_timed_px(result)} px, s (log scale)"
         charts.speed_chart(rows, method_styles, ("training, s (log scale)", frame, PSNR), caption, paths[""])
         drawn.append(paths[""])
