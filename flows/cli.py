@@ -192,11 +192,8 @@ def _parser() -> argparse.ArgumentParser:
     synchronise = add(commands.synchronise, caged)
     synchronise.add_argument("folder", type=path, help="capture whose cameras did not start together")
     cameras = add(commands.export_cameras, caged)
-    cameras.add_argument(
-        "folder",
-        type=path,
-        help="capture folder, what `hnerf calibrate` wrote, or <store>/subjects/<name>/calibration",
-    )
+    what = "capture folder, what `hnerf calibrate` wrote, or <store>/subjects/<name>/calibration"
+    cameras.add_argument("folder", type=path, help=what)
     cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True, help="format to write")
     _add_out(cameras, "cameras")
 
@@ -221,14 +218,11 @@ def _add_overrides(command: argparse.ArgumentParser, what: str) -> None:
 
 def _add_calibrate(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=path, help="capture folder, or a folder with calibration/extrinsic/")
-    command.add_argument(
-        "--from", dest="source", choices=("boards", "person"), default="boards",
-        help="calibrate from footage of a board (default), or from the person in the capture",
-    )  # fmt: skip
+    what = "calibrate from footage of a board (default), or from the person in the capture"
+    command.add_argument("--from", dest="source", choices=("boards", "person"), default="boards", help=what)
     _add_out(command, "cameras")
-    command.add_argument(
-        "--format", choices=CAMERA_FORMATS, action="append", default=[], help="also write this format; may be repeated"
-    )
+    what = "also write this format; may be repeated"
+    command.add_argument("--format", choices=CAMERA_FORMATS, action="append", default=[], help=what)
     boards = command.add_argument_group("from boards")
     what = "frame in which the board lies on the floor: the world's origin"
     boards.add_argument("--ground-frame", type=number(int, 0, MAX_COUNT), metavar="N", help=what)
@@ -242,13 +236,10 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
 
 def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument("subject", type=path, help="<store>/subjects/<name> of a finished `hnerf run`")
-    export.add_argument(
-        "--motion", type=path, action="append", default=[], metavar="FILE",
-        help=f"add this motion: {MOTIONS}",
-    )  # fmt: skip
-    export.add_argument(
-        "--allow-poor", action="store_true", help="accept an asset that is more than 4 dB below its field"
-    )
+    what = f"add this motion: {MOTIONS}"
+    export.add_argument("--motion", type=path, action="append", default=[], metavar="FILE", help=what)
+    what = "accept an asset that is more than 4 dB below its field"
+    export.add_argument("--allow-poor", action="store_true", help=what)
     _add_out(export, "asset")
     _add_overrides(export, "override a setting under `asset.`")
 
@@ -261,9 +252,8 @@ def _add_study(command: argparse.ArgumentParser, default: str, folder: str) -> N
     study = command.add_mutually_exclusive_group()
     what = f"study of configs/{folder}/, or a YAML file (default: {default})"
     study.add_argument("--study", default=default, help=what)
-    study.add_argument(
-        "--quick", dest="study", action="store_const", const="quick", help="the study `quick`, about 15 minutes"
-    )
+    what = "the study `quick`, about 15 minutes"
+    study.add_argument("--quick", dest="study", action="store_const", const="quick", help=what)
 
 
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
@@ -276,16 +266,14 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
 
 def _add_ablate(ablations: argparse.ArgumentParser) -> None:
     _add_overrides(ablations, "override a setting in all rows")
-    ablations.add_argument(
-        "--only", nargs="+", default=[], metavar="NAME", help="only these rows, named as in configs/ablations/"
-    )
+    what = "only these rows, named as in configs/ablations/"
+    ablations.add_argument("--only", nargs="+", default=[], metavar="NAME", help=what)
 
 
 def _add_stability(stability: argparse.ArgumentParser) -> None:
     _add_study(stability, "full", "stability")
-    stability.add_argument(
-        "--methods", type=_names, default=[], metavar="LIST", help="presets, like fast,nerf (default: the study's)"
-    )
+    what = "presets, like fast,nerf (default: the study's)"
+    stability.add_argument("--methods", type=_names, default=[], metavar="LIST", help=what)
     stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
 
 
@@ -299,10 +287,8 @@ def _names(text: str) -> list[str]:
 def _add_render(render: argparse.ArgumentParser) -> None:
     render.add_argument("subject", type=path, help="<store>/subjects/<name> of a finished `hnerf run`")
     _add_out(render, "pictures")
-    render.add_argument(
-        "--what", type=_names, default="colour", metavar="LIST",
-        help=f"one or more of {','.join(PICTURES)} (default: colour)",
-    )  # fmt: skip
+    what = f"one or more of {','.join(PICTURES)} (default: colour)"
+    render.add_argument("--what", type=_names, default="colour", metavar="LIST", help=what)
     view = render.add_mutually_exclusive_group()
     view.add_argument("--camera", help="look through this recorded camera (default: an orbit)")
     view.add_argument("--path", type=path, help="fly along these cameras: a JSON list, or a folder")
@@ -310,12 +296,10 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     render.add_argument("--radius", type=number(float, 0.1, MAX_M), metavar="M", help=what)
     what = "height above the person's middle (default: that of the recorded cameras)"
     render.add_argument("--height", type=number(float, -MAX_M, MAX_M), metavar="M", help=what)
-    render.add_argument(
-        "--motion", type=path, metavar="FILE", help=f"show this motion: {MOTIONS} (default: the captured one)"
-    )
-    render.add_argument(
-        "--frames", default=":", metavar="FIRST:END:STEP", help="frames to show, or one number (default: all)"
-    )
+    what = f"show this motion: {MOTIONS} (default: the captured one)"
+    render.add_argument("--motion", type=path, metavar="FILE", help=what)
+    what = "frames to show, or one number (default: all)"
+    render.add_argument("--frames", default=":", metavar="FIRST:END:STEP", help=what)
     what = "interpolate between the poses of two frames"
     render.add_argument("--between", nargs=2, type=number(int, 0, MAX_COUNT), metavar="FRAME", help=what)
     what = "add X to a shape value of the body; may be repeated"

@@ -123,26 +123,14 @@ def add_store_commands(store: argparse.ArgumentParser) -> None:
         added[name].set_defaults(command=action)
     for name in ("show", "export"):
         added[name].add_argument("name", help="subject, as `hnerf store list` shows it")
-    added["verify"].add_argument(
-        "names", nargs="*", metavar="NAME", help="check these subjects alone (default: the whole store)"
-    )
-    added["gc"].add_argument(
-        "--yes", action="store_true", help="remove what is listed; without this, nothing is changed"
-    )
-    added["gc"].add_argument(
-        "--keep",
-        type=number(int, 1, MAX_COUNT),
-        default=1,
-        metavar="N",
-        help="keep the results of the N newest runs of each subject that made an asset (default: 1)",
-    )
-    added["gc"].add_argument(
-        "--older",
-        type=duration_s,
-        default="1d",
-        metavar="TIME",
-        help="only what has not been used for so long: 30d, 12h, 0 (default: 1d)",
-    )
+    what = "check these subjects alone (default: the whole store)"
+    added["verify"].add_argument("names", nargs="*", metavar="NAME", help=what)
+    what = "remove what is listed; without this, nothing is changed"
+    added["gc"].add_argument("--yes", action="store_true", help=what)
+    what = "keep the results of the N newest runs of each subject that made an asset (default: 1)"
+    added["gc"].add_argument("--keep", type=number(int, 1, MAX_COUNT), default=1, metavar="N", help=what)
+    what = "only what has not been used for so long: 30d, 12h, 0 (default: 1d)"
+    added["gc"].add_argument("--older", type=duration_s, default="1d", metavar="TIME", help=what)
     added["export"].add_argument("--out", type=path, help="new file to write (default: NAME.tar)")
     added["import"].add_argument("archive", type=path, help="archive of `hnerf store export`")
     for parser in added.values():
