@@ -235,7 +235,7 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
-    export.add_argument("subject", type=path, help="<store>/subjects/<name> of a finished `hnerf run`")
+    export.add_argument("subject", type=path, help=FOLDERS["subject"])
     what = f"add this motion: {MOTIONS}"
     export.add_argument("--motion", type=path, action="append", default=[], metavar="FILE", help=what)
     what = "accept an asset that is more than 4 dB below its field"
@@ -285,7 +285,7 @@ def _names(text: str) -> list[str]:
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
-    render.add_argument("subject", type=path, help="<store>/subjects/<name> of a finished `hnerf run`")
+    render.add_argument("subject", type=path, help=FOLDERS["subject"])
     _add_out(render, "pictures")
     what = f"one or more of {','.join(PICTURES)} (default: colour)"
     render.add_argument("--what", type=_names, default="colour", metavar="LIST", help=what)
