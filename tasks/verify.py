@@ -36,11 +36,8 @@ def faults(store: Store, subjects: Iterable[str] = ()) -> Checked:
         chosen = [inventory.stored[name] for name in sorted(names)]
     lines = [] if wanted else [f"{record}: {_why_unreadable(record)}" for record in inventory.unreadable]
     for subject, latest in links.items():
-        lines += [
-            f"{store.subject_folder(subject) / stage}: leads nowhere"
-            for stage, name in latest.items()
-            if name not in inventory.stored
-        ]
+        lost = [stage for stage, name in latest.items() if name not in inventory.stored]
+        lines += [f"{store.subject_folder(subject) / stage}: leads nowhere" for stage in lost]
     for one in chosen:
         lines += _faults(one.artifact)
     count = sum(len(one.artifact.files) for one in chosen)

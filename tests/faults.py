@@ -372,7 +372,7 @@ FAULTS = (
     Fault("surface-one-way", "evaluation/geometry", "distance_p.mean() + distance_t.mean()",
           "distance_p.mean() + distance_p.mean()"),
     Fault("surface-closed-truth", "evaluation/geometry", "bool(predicted.is_watertight)", "bool(truth.is_watertight)"),
-    Fault("ssim-sample-covariance", "evaluation/metrics", "use_sample_covariance=False", "use_sample_covariance=True"),
+    Fault("ssim-sample-covariance", "evaluation/metrics", 'covariance": False', 'covariance": True'),
     Fault("psnr-amplitude", "evaluation/metrics", "-10 * np.log10(", "-20 * np.log10("),
     # retries, resumed work and cached results
     Fault("retry-lost-worker", "tasks/policy", "OSError | LostWorkerError)", "OSError)"),

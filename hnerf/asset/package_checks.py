@@ -43,11 +43,8 @@ def _extent_defects(root: Usd.Prim) -> list[str]:
 def _look_defects(root: Usd.Prim) -> list[str]:
     """Return the defects of the meshes' materials, and of the light that an albedo needs to look as captured."""
     prims = list(Usd.PrimRange(root))
-    bare = [
-        prim
-        for prim in prims
-        if prim.IsA(UsdGeom.Mesh) and not UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-    ]
+    meshes = [prim for prim in prims if prim.IsA(UsdGeom.Mesh)]
+    bare = [mesh for mesh in meshes if not UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0]]
     defects = [f"{prim.GetPath()}: no material is bound" for prim in bare]
     if root.GetVariantSet("look").GetVariantSelection() == "albedo":
         domes = [UsdLux.DomeLight(prim) for prim in prims if prim.IsA(UsdLux.DomeLight)]

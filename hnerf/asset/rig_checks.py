@@ -42,7 +42,7 @@ def skin_defects(prim: Usd.Prim) -> list[str]:
         defects += [f"{name}: {eye} does not turn about the middle of its ball" for eye in off]
     if not abs(points[:, 1].min()) < (ON_GROUND_M if as_captured else ON_GROUND_CHANGED_M):
         defects.append(f"{name}: its lowest point at rest is at height {points[:, 1].min():.3g} m, not on the ground")
-    if _selected(prim.GetStage(), "rig") == GAME and influences > GAME_INFLUENCES:
+    if _selected(stage, "rig") == GAME and influences > GAME_INFLUENCES:
         defects.append(f"{name}: {influences} influences; the game rig has at most {GAME_INFLUENCES}")
     return defects
 

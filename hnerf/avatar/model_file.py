@@ -24,10 +24,8 @@ def write_field(field: nn.Module, path: Path) -> None:
             step = (features.abs().max() / MAX_STEPS).clamp(min=torch.finfo(features.dtype).tiny)
             steps = (features / step).round().to(torch.int8).cpu()
             packed = torch.frombuffer(bytearray(zlib.compress(steps.numpy().tobytes())), dtype=torch.uint8)
-            tensors |= {
-                f"{name}.levels.{level}{STEP_SUFFIX}": step.cpu(),
-                f"{name}.levels.{level}{STEPS_SUFFIX}": packed,
-            }
+            key = f"{name}.levels.{level}"
+            tensors |= {f"{key}{STEP_SUFFIX}": step.cpu(), f"{key}{STEPS_SUFFIX}": packed}
     path.write_bytes(save(tensors))  # safetensors' own writer raises no OSError on a full disk
 
 

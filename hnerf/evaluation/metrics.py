@@ -47,11 +47,8 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
     """Return the structural similarity (Wang et al. 2004) of images (H, W, 3) in [0, 1]: Gaussian window of 11 px,
     sigma 1.5."""
-    return float(
-        structural_similarity(
-            a, b, channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
-        )
-    )
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return float(structural_similarity(a, b, channel_axis=2, data_range=1, **window))
 
 
 def mask_iou(coverage: np.ndarray, mask: np.ndarray) -> float:
