@@ -23,11 +23,11 @@ class Field(nn.Module, ABC):
     """Base class of H-NeRF's two fields and the compared methods.
 
     canonical_m (V, 3): the rig's canonical vertices, saved with the field. samples: random numbers needed per ray.
-    gamma: sharpness of the silhouette, per unit of the distances that `sample` returns. margin_m: how far around the
-    body's extent anything can be visible. models_background: whether the field models the photograph's background;
-    otherwise it is composited over the clean plate. whole_images: whether training draws from all pixels, or only from
-    `visible_pixels` and the mask's. common_rest: whether the rest body absorbs changes that training makes to all poses
-    alike.
+    unit_m: unit of the distances that `sample` returns. gamma: sharpness of the silhouette, per such unit. margin_m:
+    how far around the body's extent anything can be visible. models_background: whether the field models the
+    photograph's background; otherwise it is composited over the clean plate. whole_images: whether training draws from
+    all pixels, or only from `visible_pixels` and the mask's. common_rest: whether the rest body absorbs changes that
+    training makes to all poses alike.
     """
 
     models_background: ClassVar[bool] = False
@@ -35,6 +35,7 @@ class Field(nn.Module, ABC):
     whole_images: bool = False
     canonical_m: Tensor
     samples: int
+    unit_m: float = 1.0
     gamma: float = 80.0  # per metre: the paper's 200 in a scene of 2.5 m
     margin_m: float = 0.1
 

@@ -41,7 +41,7 @@ class PaperField(Field):
         super().__init__()
         self.settings, self.static = settings, static
         self.whole_images = settings.rays == "image"
-        self.samples, self.gamma = settings.samples, settings.gamma
+        self.samples, self.gamma, self.unit_m = settings.samples, settings.gamma, settings.scene_m
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
         root_inputs = 12 if settings.root_condition else 0

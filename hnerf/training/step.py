@@ -50,7 +50,8 @@ class Objective(nn.Module):
             "elastic": lambda: losses.elastic(samples),
         }
         if self.ground_axis is not None:
-            terms["floor"] = lambda: losses.floor(samples.d_hat, rays.points(depths_m)[..., self.ground_axis])
+            d_hat_m = self.field.unit_m * samples.d_hat
+            terms["floor"] = lambda: losses.floor(d_hat_m, rays.points(depths_m)[..., self.ground_axis])
         return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
 
 

@@ -236,6 +236,7 @@ def test_distances_are_in_scene_units_and_their_gradients_per_metre(
     d, dd = torch.ones(8), torch.zeros(8)
     d[3:6], dd[3:6] = torch.tensor([0.025, -0.025, -0.025]), torch.tensor(residual)
     expect_close(samples.d, d[None])
+    assert field_of(static).unit_m == 2.0
     expect_close(samples.residual, dd[None])
     expect_close(samples.alpha_dot, 1 / (1 + torch.exp(200 * (d + dd)))[None], atol=2e-3)
     expect_close(samples.gradient_norm, torch.tensor(norms))

@@ -56,12 +56,13 @@ def test_without_a_plate_surroundings_are_random_and_the_outline_is_left_out() -
 
 
 def objective_terms(
-    settings: TrainingSettings, samples: RaySamples = SAMPLES, depths_m: Tensor | None = None, axis: int | None = None
-) -> dict[str, Tensor]:
+    settings: TrainingSettings, samples: RaySamples = SAMPLES, depths_m: Tensor | None = None, axis: int | None = None,
+    unit_m: float = 1.0,
+) -> dict[str, Tensor]:  # fmt: skip
     """Return the losses of the rays of test_losses, for a field with gamma 80; the rays start at z = 1 m and go down.
-    depths_m: depths of the samples; axis: the vertical axis."""
+    depths_m: depths of the samples; axis: the vertical axis; unit_m: of the field's distances."""
     field: Any = torch.nn.Module()
-    field.models_background, field.gamma = True, 80.0
+    field.models_background, field.gamma, field.unit_m = True, 80.0, unit_m
     field.sample = lambda *inputs: (samples, depths_m)
     correction = PoseCorrection(frames=2, free_joints=0, shapes=2)
     correction.absorbed_shape.copy_(torch.tensor([3.0, 4.0]))
@@ -95,10 +96,12 @@ def test_each_loss_gets_its_own_inputs_and_weight() -> None:
 
 def test_the_floor_loss_covers_samples_below_the_ground() -> None:
     """The second sample of the first ray is 10 cm below the ground, and its d_hat is -0.02: a mean of 0.01 over two
-    rays, times 3. If the ground is unknown, there is no floor loss."""
+    rays, times 3, and times 2.5 for a field whose distances are in units of 2.5 m. If the ground is unknown, there is
+    no floor loss."""
     settings, depths_m = TrainingSettings(losses=LossSettings(floor=3)), torch.tensor([[0.9, 1.1], [0.5, 0.8]])
     known, unknown = (objective_terms(settings, depths_m=depths_m, axis=axis) for axis in (2, None))
     assert known["floor"].item() == pytest.approx(0.03)
+    assert objective_terms(settings, SAMPLES, depths_m, 2, unit_m=2.5)["floor"].item() == pytest.approx(0.075)
     assert "floor" not in unknown
 
 
