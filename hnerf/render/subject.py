@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hnerf.avatar.finished import avatar_of, readable, recording_of, require_files, require_poses
+from hnerf.avatar.finished import (
+    avatar_of,
+    readable,
+    reason_without_novel_poses,
+    recording_of,
+    require_files,
+    require_poses,
+)
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
 from hnerf.capture.capture import Capture
@@ -28,7 +35,8 @@ MIN_SIZE_PX, MAX_SIZE_PX = 2, 8000  # square videos of either size can be read b
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options of a rendering; by default a camera orbits the person through all fitted frames.
+    """Options of a rendering; by default a camera orbits the person through all fitted frames, or through those trained
+    on if the method has no new poses.
 
     camera: a recorded camera's name; path: a file or folder of cameras to fly along (`read_camera_path`); with neither,
     the camera orbits at this radius and at this height above the person's centre, in metres (`orbit`). motion: another
@@ -90,6 +98,8 @@ def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
     """Return the poses to show, on the body shape to show."""
     with readable(subject / "training"):
         own = BodyFit.load(subject / "training")
+        if reason_without_novel_poses(subject / "training"):
+            own = select_poses(own, tuple(frame for frame in own.frames if frame in capture.train_frames))
     if options.motion is None:
         motion = Motion(select_poses(own, select_frames(own.frames, options.frames, subject)), capture.fps, capture.up)
     else:

@@ -25,7 +25,7 @@ from hnerf.config import load_settings
 from hnerf.progress import Progress, listening
 from hnerf.render.motion import interpolate_poses
 from hnerf.render.subject import RenderOptions, _cameras
-from tests.training.scene import TINY, record
+from tests.training.scene import TINY, record, tiny
 
 
 @pytest.fixture(scope="module")
@@ -226,6 +226,20 @@ def test_a_model_without_poses_shows_recorded_frames_only(
     stored = {"static": True, "training": load_settings("nerfies").training.model_dump()}
     (copy / "training" / "settings.json").write_text(json.dumps(stored))
     assert "copy: Nerfies has no pose to set" in refusal(copy, *options)
+
+
+def test_a_model_without_poses_shows_the_frames_that_it_was_trained_on(
+    copy: Path, tmp_path: Path, refusal: Callable[..., str]
+) -> None:
+    """Frame 2 is a new pose: evaluation has no picture of it, either."""
+    settings, body = tiny("nerfies", pose_learning_rate=0.0), BodyFit.load(copy / "training")
+    write_field(build_field(settings.field, body, False), copy / "training" / "model.safetensors")
+    stored = {"static": False, "training": settings.model_dump()}
+    (copy / "training" / "settings.json").write_text(json.dumps(stored))
+    options = ["--size", "8", "--what", "mask"]
+    assert main(["render", str(copy), "--out", str(tmp_path / "all"), *options]) == 0
+    assert numbers(tmp_path / "all", "mask") == ["000000", "000001"]
+    assert "copy: no frames 2; it has 0 to 1" in refusal(copy, "--frames", "2", *options)
 
 
 def test_an_existing_folder_is_not_overwritten(
