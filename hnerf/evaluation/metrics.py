@@ -8,6 +8,7 @@ from skimage.metrics import structural_similarity
 from hnerf.evaluation.lpips import lpips
 
 BOX_PADDING_PX = 20
+WINDOW_PX = 11  # of SSIM
 COVERED_LEVEL = 127  # of 255; a rendered pixel with more coverage counts as person, however dark it is
 
 
@@ -46,7 +47,9 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
     """Return the structural similarity (Wang et al. 2004) of images (H, W, 3) in [0, 1]: Gaussian window of 11 px,
-    sigma 1.5."""
+    sigma 1.5. Images that are smaller than the window are padded with black."""
+    missing = [(0, max(0, WINDOW_PX - side)) for side in a.shape[:2]]
+    a, b = (np.pad(image, [*missing, (0, 0)]) for image in (a, b))
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     return float(structural_similarity(a, b, channel_axis=2, data_range=1, **window))
 

@@ -31,6 +31,14 @@ def test_ssim_of_one_window_by_hand() -> None:
     assert ssim(a, b) == pytest.approx((luminance * (2 * cov + 9e-4) / (var_a + var_b + 9e-4)).mean(), abs=1e-9)
 
 
+def test_ssim_of_images_smaller_than_its_window() -> None:
+    """With black below them, 9 rows have as many as the window."""
+    a, b = np.random.default_rng(0).random((2, 11, 16, 3))
+    a[9:] = b[9:] = 0
+    assert ssim(a[:9], b[:9]) == ssim(a, b) < 0.5
+    assert ssim(a[:9, :5], a[:9, :5]) == pytest.approx(1.0)
+
+
 def test_mask_box_is_padded_and_clipped_to_the_image() -> None:
     mask = np.zeros((100, 80), bool)
     mask[30:41, 5:9] = True
