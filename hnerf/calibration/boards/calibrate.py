@@ -25,6 +25,7 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MAX_TILT_DEG = 75.0  # a board tilted further is too slanted to be detected
+MAX_OFF = 0.003  # of an image's longer side, by a camera's median corner: ten times what good footage leaves
 INTRINSICS = ("intri.yml", "camera_array.toml", "calibration.toml")
 WHOLE_CALIBRATIONS = ("sparse", "calibration/Calib*.toml")
 
@@ -86,6 +87,7 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
     corners = BoardCorners(tuple(lenses), footage.board.corners_m, corners_px, footage.frame_step, footage.frames)
     fit = rig.solve_rig(cameras, rig.planar_corners(corners))
+    _check_agreement(footage, fit)
     if ground_frame is not None:
         fit = _on_ground(fit, footage, ground_frame)
     lenses = {c.name: dataclasses.replace(lenses[c.name], R=c.R, t_m=c.t_m) for c in fit.cameras}
@@ -149,6 +151,17 @@ def _check_board_found(footage: BoardFootage) -> None:
         raise InputError(
             f"{footage.path}: this board was found in {found.sum()} of {found.size} pictures; check its columns, rows, "
             "dictionary and inverted in charuco.toml or capture.toml"
+        )
+
+
+def _check_agreement(footage: BoardFootage, fit: BoardFit) -> None:
+    """Raise InputError if the cameras do not see one board: no poses then explain a camera's corners."""
+    off_px = [float(np.median(fit.error_px(i))) for i in range(len(fit.cameras))]
+    worst = int(np.argmax([px / max(camera.size_px) for px, camera in zip(off_px, fit.cameras, strict=True)]))
+    if off_px[worst] > MAX_OFF * max(fit.cameras[worst].size_px):
+        raise InputError(
+            f"{footage.path}: camera {fit.cameras[worst].name}: its corners are {off_px[worst]:.1f} px from the board "
+            "that all cameras see; cut the footage so that all cameras start within a frame, or correct the intrinsics"
         )
 
 

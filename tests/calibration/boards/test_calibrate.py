@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.boards import calibrate as calibration_boards
-from hnerf.calibration.boards.bundle import Adjustment, Poses
+from hnerf.calibration.boards.bundle import Adjustment, BoardFit, Poses
 from hnerf.calibration.boards.calibrate import board_evidence, calibrate_from_boards, visible_and_found
 from hnerf.calibration.boards.lens import estimate_lens
 from hnerf.calibration.boards.rig import compare_pairs, fixes_pose, planar_corners, solve_boards, solve_rig
@@ -322,6 +323,29 @@ def test_a_board_found_in_few_images_is_refused_as_the_wrong_board(
     footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), 1, found, dict.fromkeys("ab", (1000, 1000)))
     monkeypatch.setattr(calibration_boards, "read_board_footage", lambda *_: footage)
     with pytest.raises(InputError, match="this board was found in 2 of 18 pictures; check its columns"):
+        calibrate_from_boards(tmp_path)
+
+
+@pytest.mark.parametrize(("off_px", "agree"), [(2.5, True), (3.5, False)])
+def test_cameras_that_do_not_see_one_board_are_refused(
+    off_px: float, agree: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when one was started some frames later. Images are 1000 px wide."""
+    cameras = rig()[:2]
+    found = dict(zip("ab", seen(cameras, {}), strict=True))
+    footage = BoardFootage(tmp_path, BOARD, tuple(range(FRAMES)), 1, found, dict.fromkeys("ab", (1000, 1000)))
+    lenses = {c.name: Lens(c.name, c.K, np.zeros(4), np.eye(3), np.zeros(3), (1000, 1000)) for c in cameras}
+
+    def solved(cameras: list[Camera], corners: BoardCorners) -> BoardFit:
+        off = np.array([0.5, off_px])[:, None, None, None] * [0.6, 0.8]
+        boards = Poses(np.tile(np.eye(3), (FRAMES, 1, 1)), np.zeros((FRAMES, 3)))
+        return BoardFit(cameras, boards, corners.corners_px, corners.corners_px + off, np.zeros((2, FRAMES)))
+
+    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda *_: footage)
+    monkeypatch.setattr(calibration_boards, "_intrinsics", lambda *_: (lenses, dict.fromkeys("ab", "given")))
+    monkeypatch.setattr(calibration_boards.rig, "solve_rig", solved)
+    refusal = nullcontext() if agree else pytest.raises(InputError, match=r"camera b: its corners are 3\.5 px from")
+    with refusal:
         calibrate_from_boards(tmp_path)
 
 
