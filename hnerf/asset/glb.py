@@ -1,6 +1,7 @@
 """Writer of glTF binary files: the skinned, textured, animated avatar in one file (glTF 2.0 specification, Khronos
 Group)."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32
 RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # left out: glTF times are in seconds
 VARIANTS, SPECULAR = "KHR_materials_variants", "KHR_materials_specular"
 DENSE_SHARE = 0.75  # of the vertices; if a blend shape moves more, 4-byte indices cost more than 12-byte zeros
-STILL = 1e-6  # metres or radians; a joint that moves less gets no channel
+STILL = 1e-6  # metres or radians; a joint that moves less stays at rest
 SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
 
 
@@ -87,9 +88,10 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     document.skins.append(gltf.Skin(inverseBindMatrices=writer.accessor(inverse_bind), joints=joints, skeleton=0))
     document.nodes.append(gltf.Node(name="Surface", mesh=0, skin=0))
     document.scenes[0].nodes = [0, len(joints)]
-    for name, motion in rig.motions.items():
-        if name not in RESAMPLED:
-            document.animations.append(_animation(writer, name, motion, rig.skeleton, len(names)))
+    motions = {name: motion for name, motion in rig.motions.items() if name not in RESAMPLED}
+    moved = np.any([_moved(motion, rig.skeleton) for motion in motions.values()], 0)
+    for name, motion in motions.items():
+        document.animations.append(_animation(writer, name, motion, rig.skeleton, len(names), moved))
     writer.save(path)
 
 
@@ -173,30 +175,41 @@ def _add_texture(writer: GlbWriter, image: np.ndarray) -> int:
     return len(writer.document.textures) - 1
 
 
-def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton, shapes: int) -> gltf.Animation:
-    """Add channels for what moves: joints that leave their transform at rest, and the weights of the correctives. The
-    expressions and physiques that follow the correctives, up to `shapes` in all, have weight 0. If all weights are 0,
-    the first and the last pose alone say so, in case another motion left the weights at other values."""
+def _animation(
+    writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton, shapes: int, moved: np.ndarray
+) -> gltf.Animation:
+    """Add channels for what moves in any motion: joints that leave their transform at rest (J, 2), and the weights of
+    the correctives. The expressions and physiques that follow the correctives, up to `shapes` in all, have weight 0.
+    Joints that stay at rest in this motion have two keys, the first and the last, and so have weights that are all 0,
+    in case another motion left them at other values."""
     animation = gltf.Animation(name=name, channels=[], samplers=[])
     seconds = ((motion.codes - motion.codes[0]) / motion.fps).astype(np.float32)
-    times = writer.accessor(seconds)
+    times = cache(lambda step: writer.accessor(seconds[::step]))
 
-    def animate(node: int, path: str, values: np.ndarray) -> None:
-        output = writer.accessor(values.astype(np.float32))
-        animation.samplers.append(gltf.AnimationSampler(input=times, output=output, interpolation=gltf.ANIM_LINEAR))
+    def animate(node: int, path: str, values: np.ndarray, still: bool) -> None:
+        step = max(len(seconds) - 1, 1) if still else 1
+        at, shown = times(step), values[::step].astype(np.float32)
+        output = writer.accessor(shown.ravel() if path == "weights" else shown)
+        animation.samplers.append(gltf.AnimationSampler(input=at, output=output, interpolation=gltf.ANIM_LINEAR))
         target = gltf.AnimationChannelTarget(node=node, path=path)
         animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
 
-    rest = skeleton.local(skeleton.bind)
-    turned = Rotation.from_matrix(rest[:, :3, :3]).as_quat()
-    for joint in range(len(skeleton.names)):
-        if np.abs(motion.translations_m[:, joint] - rest[joint, :3, 3]).max() > STILL:
-            animate(joint, "translation", motion.translations_m[:, joint])
-        if (1 - np.abs(motion.quaternions[:, joint] @ turned[joint])).max() > STILL**2 / 8:
-            animate(joint, "rotation", motion.quaternions[:, joint])
+    still = ~_moved(motion, skeleton)
+    for joint, kind in np.argwhere(moved).tolist():
+        path, values = (("translation", motion.translations_m), ("rotation", motion.quaternions))[kind]
+        animate(joint, path, values[:, joint], still[joint, kind])
     if motion.shape_weights.size:
         weights = np.pad(motion.shape_weights, ((0, 0), (0, shapes - motion.shape_weights.shape[1])))
-        if len(weights) > 2 and not weights.any():
-            weights, times = weights[:2], writer.accessor(seconds[[0, -1]])
-        animate(len(skeleton.names), "weights", weights.ravel())
+        animate(len(skeleton.names), "weights", weights, not weights.any())
     return animation
+
+
+def _moved(motion: JointMotion, skeleton: Skeleton) -> np.ndarray:
+    """Return which joints leave their place and which their rotation at rest, (J, 2)."""
+    rest = skeleton.local(skeleton.bind)
+    turned = Rotation.from_matrix(rest[:, :3, :3]).as_quat()
+    moved = np.zeros((len(rest), 2), bool)
+    for joint in range(len(rest)):
+        moved[joint, 0] = np.abs(motion.translations_m[:, joint] - rest[joint, :3, 3]).max() > STILL
+        moved[joint, 1] = (1 - np.abs(motion.quaternions[:, joint] @ turned[joint])).max() > STILL**2 / 8
+    return moved

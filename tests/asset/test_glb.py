@@ -213,6 +213,23 @@ def test_weights_that_stay_zero_have_two_keys(staged: StagedAvatar, tmp_path: Pa
     assert document.accessors[joint.input].count == len(FRAMES)
 
 
+def test_a_joint_that_one_motion_moves_is_put_back_by_the_others(staged: StagedAvatar, tmp_path: Path) -> None:
+    """In Blender, joints without keys keep the pose that another motion left."""
+    full = staged.rigs["full"]
+    captured = full.motions["captured"]
+    rest = Rotation.from_matrix(full.skeleton.local(full.skeleton.bind)[2, :3, :3]).as_quat()
+    quaternions = captured.quaternions.copy()
+    quaternions[:, 2] = rest
+    motions = {"captured": captured, "stiff": dataclasses.replace(captured, quaternions=quaternions)}
+    write_glb(tmp_path / "two.glb", staged, dataclasses.replace(full, motions=motions))
+    document = pygltflib.GLTF2.load(str(tmp_path / "two.glb"))
+    moved, stiff = ([(c.target.node, c.target.path) for c in a.channels] for a in document.animations)
+    assert moved == stiff
+    sampler = document.animations[1].samplers[stiff.index((2, "rotation"))]
+    np.testing.assert_allclose(accessor(document, sampler.input)[:, 0], [0, 0.5])
+    np.testing.assert_allclose(accessor(document, sampler.output), [rest, rest], atol=1e-7)
+
+
 def test_expressions_and_physiques_are_morph_targets_after_the_correctives(glb: Path, staged: StagedAvatar) -> None:
     document = pygltflib.GLTF2.load(str(glb))
     (mesh,) = document.meshes
