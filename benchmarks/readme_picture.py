@@ -1,6 +1,6 @@
 """Draw the README's picture from a finished subject: photograph, fitted body, rendered avatar, surface.
 
-usage: python benchmarks/readme_picture.py SUBJECT_DIR [--camera NAME] [--frame N] [--out docs/valid-wave.png]
+usage: python benchmarks/readme_picture.py SUBJECT_DIR [--camera NAME] [--frame N] [--out docs/valid-walk.png]
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("subject", type=Path)
     parser.add_argument("--camera", default="05")
     parser.add_argument("--frame", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("docs/valid-wave.png"))
+    parser.add_argument("--out", type=Path, default=Path("docs/valid-walk.png"))
     options = parser.parse_args()
     capture = recording_of(options.subject)
     fitted, avatar = BodyFit.load(options.subject / "fit"), load_avatar(options.subject / "training", "cpu")
