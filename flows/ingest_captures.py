@@ -78,7 +78,7 @@ def ingest_captures(
         if digest is None:
             continue
         if not ledger.knows(digest):
-            parameters = {"capture": str(capture), "preset": preset, "store": str(store.resolve())}
+            parameters = {"capture": str(capture), "preset": preset, "store": str(store.absolute())}
             key = ledger.start_key(digest)
             run = run_deployment(DEPLOYMENT, parameters=parameters, timeout=0, as_subflow=False, idempotency_key=key)
             ledger.note_started(digest, capture, run.id)  # type: ignore[union-attr]
@@ -110,7 +110,7 @@ def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tup
     if isinstance(folder, str):
         yield from _unseen_in_bucket(folder, ledger, settle_s)
         return
-    for capture in _captures(folder.resolve()):
+    for capture in _captures(folder.absolute()):  # elsewhere, a link may lead to another place
         try:
             listing, touched_s = _listing(capture)
             if touched_s and time.time() - touched_s >= settle_s and not ledger.seen(listing):

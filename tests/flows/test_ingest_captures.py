@@ -275,6 +275,24 @@ def test_links_out_of_the_folder_are_not_followed(watched: Path, caplog: pytest.
     assert "ada: is a symbolic link and not followed" in caplog.text
 
 
+def test_runs_are_given_the_folders_by_the_names_that_other_machines_know(
+    watched: Path, runs: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container, which mounts what is at ./captures and ./store, wherever links lead on this machine."""
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "checkout").mkdir()
+    monkeypatch.chdir(tmp_path / "checkout")
+    Path("captures").symlink_to(watched)
+    Path("store").symlink_to(tmp_path / "disk")
+    assert ingest_captures.fn(Path("captures"), "demo", Path("store"), 0.0) == ["ada", "bob"]
+    assert runs[0]["capture"] == str(tmp_path / "checkout" / "captures" / "ada")
+    assert runs[0]["store"] == str(tmp_path / "checkout" / "store")
+    with pytest.raises(InputError, match="no such folder"):
+        (watched / "ada").rename(watched / "eve")
+        train_subject.fn(Path(runs[0]["capture"]), "demo", Path("store"))
+    assert ingest_captures.fn(Path("captures"), "demo", Path("store"), 0.0) == ["eve"]
+
+
 def test_names_that_are_not_utf_8_are_captures_too(watched: Path) -> None:
     (watched / "ada" / os.fsdecode(b"caf\xe9.txt")).touch()
     assert look(watched) == ["ada", "bob"]
