@@ -29,7 +29,7 @@ from tasks.limits import set_limits
 from tasks.quarantine import clear, note_run
 from tasks.quiet import EXPECTED
 from tasks.remote import fetched, remote_capture
-from tasks.source import NothingThereError, path_or_url, read_capture
+from tasks.source import GoneError, path_or_url, read_capture
 from tasks.stage import retried
 from tasks.store import OPTIONAL, Artifact, Store
 from tasks.training import train
@@ -62,7 +62,11 @@ def train_subject(
         overrides: Settings that differ from the preset, like training.steps=2000; `hnerf settings` lists all.
     """
     with shown_progress():
-        return train_avatar(capture, preset, store, overrides or ())
+        try:
+            return train_avatar(capture, preset, store, overrides or ())
+        except GoneError:  # the capture may be started again from wherever it is now
+            forget(store.resolve(), path_or_url(capture))
+            raise
 
 
 def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Sequence[str]) -> Trained:
@@ -71,11 +75,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
     capture = path_or_url(capture)
-    try:
-        source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
-    except NothingThereError:  # so that it may be started again from wherever it is now
-        forget(artifact_store.root, capture)
-        raise
+    source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
     recorded = ingest(artifact_store, source, settings.capture)
     normalised = Capture.load(recorded.root)
     held_out_cameras(normalised.train_cameras, normalised.test_cameras, settings.evaluation.holdout)

@@ -6,6 +6,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest as ingest_folder
 from hnerf.capture.subset import subset
 from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
 from tasks.cage import run_caged
 from tasks.source import Source, require_unchanged
 from tasks.stage import stage
@@ -15,7 +16,11 @@ from tasks.store import Artifact
 @stage("capture", version="19")
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
     """Read a recording in any supported layout; undistort and normalise it."""
-    run_caged(ingest_folder, source.root, settings, out, folder=source.root)
+    try:
+        run_caged(ingest_folder, source.root, settings, out, folder=source.root)
+    except (InputError, FileNotFoundError):
+        require_unchanged(source)  # a recording that is moved or replaced meanwhile looks damaged
+        raise
     require_unchanged(source)
     capture = Capture.load(out)
     return {"cameras": len(capture.cameras), "frames": len(capture.frames)}

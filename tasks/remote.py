@@ -12,7 +12,7 @@ from hnerf.errors import InputError
 from hnerf.progress import tracked
 from tasks.bucket import Bucket, RemoteFile
 from tasks.packed import require_room
-from tasks.source import NothingThereError
+from tasks.source import GoneError
 from tasks.stage import stage
 from tasks.store import Store
 
@@ -46,10 +46,10 @@ def remote_captures(folder: str) -> Iterator[RemoteCapture]:
 
 
 def remote_capture(url: str) -> RemoteCapture:
-    """Return the capture at a URL. Raises NothingThereError if there is no file."""
+    """Return the capture at a URL. Raises GoneError if there is no file."""
     capture = RemoteCapture(url.rstrip("/"), tuple(Bucket.at(url).files("")))
     if not capture.files or capture.name in (".", ".."):
-        raise NothingThereError(f"{url}: no such folder; give the capture's folder")
+        raise GoneError(f"{url}: no such folder; give the capture's folder")
     return capture
 
 
@@ -62,7 +62,7 @@ def fetched(store: Store, capture: RemoteCapture) -> Path:
 def fetch(out: Path, url: str, digest: str) -> dict[str, float]:
     """Fetch the capture at a URL, with this digest, from a bucket."""
     capture, bucket = remote_capture(url), Bucket.at(url)
-    changed = InputError(f"{url}: has changed since it was listed; give the same command again")
+    changed = GoneError(f"{url}: has changed since it was listed; give the same command again")
     size_bytes = sum(file.size_bytes for file in capture.files)
     require_room(size_bytes, out, url)
     for file in tracked(capture.files, "files", len(capture.files)):

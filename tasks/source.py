@@ -15,8 +15,8 @@ GROUND_TRUTH = "ground_truth"
 MAX_FILE_BYTES = 1 << 38  # a sparse file takes no disk space, but hours to read
 
 
-class NothingThereError(InputError):
-    """There is no file at a path or URL."""
+class GoneError(InputError):
+    """There is no capture at a path or URL, or no longer."""
 
 
 def path_or_url(given: Path | str) -> Path | str:
@@ -43,12 +43,12 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
     also be a single video, which has no ground truth.
 
     Hidden files do not count. A symbolic link counts as the path that it holds: its target is either in the folder
-    itself or not part of it. Raises NothingThereError if there is no such folder, and InputError if a file cannot be
+    itself or not part of it. Raises GoneError if there is no such folder, and InputError if a file cannot be
     read, or the store is inside the capture, whose digest would then change with every run.
     """
     folder = folder.resolve()
     if not folder.exists():
-        raise NothingThereError(f"{folder}: no such folder or video; give the capture's folder")
+        raise GoneError(f"{folder}: no such folder or video; give the capture's folder")
     if store and store.resolve().is_relative_to(folder):
         raise InputError(f"{store.resolve()}: lies in the capture's folder; give --store another folder")
     shown = os.fsencode(folder).decode(errors="replace")
@@ -65,11 +65,12 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
 
 def require_unchanged(source: Source) -> None:
     """Raise InputError if the files of a recording or a ground truth no longer match its digest: results from other
-    files must not be found under that key later."""
-    files = _parts(source.root)[source.is_truth] if source.root.exists() else []
+    files must not be found under that key later. It is a GoneError if the whole folder is gone."""
+    kind = InputError if source.root.exists() else GoneError
+    files = [] if kind is GoneError else _parts(source.root)[source.is_truth]
     if _digest(source.root, files) != source.digest:
         folder = source.root / GROUND_TRUTH if source.is_truth else source.root
-        raise InputError(f"{folder}: changed or moved since the command started; run the same command again")
+        raise kind(f"{folder}: changed or moved since the command started; run the same command again")
 
 
 def capture_files(folder: Path) -> list[Path]:

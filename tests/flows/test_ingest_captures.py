@@ -246,6 +246,20 @@ def test_a_folder_renamed_while_its_run_waits_is_trained_under_its_new_name(
     assert runs[-1]["capture"] == str(watched / "eve") and look(watched) == []
 
 
+def test_a_folder_renamed_while_it_is_read_is_trained_under_its_new_name(
+    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(*_: object, **__: object) -> None:
+        (watched / "ada").rename(watched / "eve")
+        raise InputError("0.jpg: image missing")
+
+    look(watched)
+    monkeypatch.setattr("tasks.capture.run_caged", read)
+    with pytest.raises(InputError, match="ada: changed or moved since the command started"):
+        train_subject.fn(Path(runs[0]["capture"]), "demo", watched.parent / "store")
+    assert look(watched) == ["eve"]
+
+
 def test_no_more_runs_are_started_than_the_limit(
     watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

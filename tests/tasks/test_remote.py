@@ -7,7 +7,7 @@ from fsspec import filesystem
 from hnerf.errors import InputError
 from tasks.bucket import VARIABLE, Bucket
 from tasks.remote import fetched, remote_capture, remote_captures
-from tasks.source import NothingThereError
+from tasks.source import GoneError
 from tasks.store import Store
 
 
@@ -83,7 +83,7 @@ def test_a_capture_that_changes_while_it_is_fetched_is_refused(
 
 @pytest.mark.parametrize("url", ["nobody", "ada/..", "bob/a.mp4", "ada?versionId=1", "empty"])
 def test_a_url_without_a_folder_is_refused(captures: str, url: str) -> None:
-    with pytest.raises(NothingThereError, match="no such folder; give the capture's folder"):
+    with pytest.raises(GoneError, match="no such folder; give the capture's folder"):
         remote_capture(f"{captures}/{url}")
 
 
