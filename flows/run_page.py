@@ -3,7 +3,7 @@
 import logging
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
@@ -18,6 +18,7 @@ from prefect.artifacts import (
 from prefect.context import FlowRunContext
 
 from hnerf.capture.safe_io import read_image
+from hnerf.errors import one_line
 from hnerf.evaluation.pictures import data_uri, shrunk
 from hnerf.progress import Progress, listening
 
@@ -30,14 +31,20 @@ log = logging.getLogger("hnerf.run_page")
 
 def publish_markdown(markdown: str, key: str, description: str) -> None:
     """Publish a text, with its images embedded, on the page of the flow run; do nothing outside a run."""
-    if FlowRunContext.get():
-        create_markdown_artifact(markdown, key=key, description=description)
+    _publish(create_markdown_artifact, markdown, key=key, description=description)
 
 
 def publish_link(path: Path, key: str, description: str) -> None:
     """Publish a link to a file on this machine; do nothing outside a run."""
+    _publish(create_link_artifact, path.as_uri(), link_text=str(path), key=key, description=description)
+
+
+def _publish(create: Callable[..., object], content: str, **options: str) -> None:
     if FlowRunContext.get():
-        create_link_artifact(path.as_uri(), link_text=str(path), key=key, description=description)
+        try:
+            create(content, **options)
+        except Exception as error:  # the server is away: the results are in the store, and the run has not failed
+            log.warning("%s: is not on the page of the run: %s", options["description"], one_line(error))
 
 
 def embedded(pictures: Sequence[tuple[str, Path]]) -> str:

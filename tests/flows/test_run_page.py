@@ -13,7 +13,7 @@ from prefect.context import FlowRunContext
 from flows import run_page
 from flows.ablations import ablate
 from flows.benchmark import benchmark
-from flows.run_page import embedded, publish_link, shown_progress, slug
+from flows.run_page import embedded, publish_link, publish_markdown, shown_progress, slug
 from flows.stability import stability
 from hnerf.errors import InputError
 from hnerf.progress import Progress, report
@@ -68,6 +68,18 @@ def test_an_unreachable_server_does_not_end_the_work(monkeypatch: pytest.MonkeyP
     page.next_s["fit"] = 0.0
     page.show(run_page.Progress("fit", 1, 2))
     create.assert_called_once()
+
+
+def test_a_run_whose_page_cannot_be_written_has_not_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(run_page, "FlowRunContext", Mock())
+    for create in ("create_markdown_artifact", "create_link_artifact"):
+        monkeypatch.setattr(run_page, create, Mock(side_effect=ConnectionError("refused")))
+    publish_markdown("# ada", "result", "Result for ada")
+    publish_link(tmp_path / "report.html", "report", "Report on ada")
+    assert "Result for ada: is not on the page of the run: refused" in caplog.text
+    assert "Report on ada: is not on the page of the run: refused" in caplog.text
 
 
 def test_a_server_that_is_away_delays_the_work_by_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
