@@ -120,7 +120,7 @@ def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.
     silhouette."""
     view = vertices_m - camera.centre_m
     edge_on = np.abs((view * normals).sum(1)) < MAX_RIM_COSINE * np.linalg.norm(view, axis=1)
-    rim = np.flatnonzero(edge_on)
+    rim = np.flatnonzero(edge_on & normals.any(1))  # vertices of no face, inside anny's caps, have no normal
     covered = silhouette(camera, vertices_m, faces).astype(np.uint8)
     depth_px = cv2.distanceTransform(np.pad(covered, 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
     deep = map_coordinates(depth_px, camera.project(vertices_m[rim])[0].T[::-1], order=0, mode="nearest")

@@ -140,6 +140,17 @@ def test_the_rim_continues_beyond_the_image_border() -> None:
         assert side.sum() > 10 and np.isin(rim[side], seen).all()
 
 
+def test_vertices_of_no_face_are_not_on_the_rim() -> None:
+    """One is as near to the outline as the vertices of the ball are."""
+    vertices, faces = ball(0.2, 1.0)
+    camera = ring_camera("a", 0.3)
+    expected = _rim(camera, vertices, normals_of(vertices, faces), faces)
+    sideways = np.cross(camera.centre_m, (0, 0, 1))
+    beside_m = 0.195 * sideways / np.linalg.norm(sideways) + (0, 0, 1)
+    with_one = np.concatenate([vertices, beside_m[None]])
+    np.testing.assert_array_equal(_rim(camera, with_one, normals_of(with_one, faces), faces), expected)
+
+
 def test_an_outline_pulls_rim_vertices_inside_it_with_matching_normals() -> None:
     """The outside of an edge is up. One rim vertex is 3 px inside, one 3 px outside, and one 3 px inside but facing
     right."""
