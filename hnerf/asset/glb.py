@@ -89,9 +89,10 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     document.nodes.append(gltf.Node(name="Surface", mesh=0, skin=0))
     document.scenes[0].nodes = [0, len(joints)]
     motions = {name: motion for name, motion in rig.motions.items() if name not in RESAMPLED}
-    moved = np.any([_moved(motion, rig.skeleton) for motion in motions.values()], 0)
-    for name, motion in motions.items():
-        document.animations.append(_animation(writer, name, motion, rig.skeleton, len(names), moved))
+    moved = [_moved(motion, rig.skeleton) for motion in motions.values()]
+    in_any = np.any(moved, 0)
+    for (name, motion), in_this in zip(motions.items(), moved, strict=True):
+        document.animations.append(_animation(writer, name, motion, len(names), in_this, in_any))
     writer.save(path)
 
 
@@ -176,12 +177,12 @@ def _add_texture(writer: GlbWriter, image: np.ndarray) -> int:
 
 
 def _animation(
-    writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton, shapes: int, moved: np.ndarray
+    writer: GlbWriter, name: str, motion: JointMotion, shapes: int, in_this: np.ndarray, in_any: np.ndarray
 ) -> gltf.Animation:
-    """Add channels for what moves in any motion: joints that leave their transform at rest (J, 2), and the weights of
-    the correctives. The expressions and physiques that follow the correctives, up to `shapes` in all, have weight 0.
-    Joints that stay at rest in this motion have two keys, the first and the last, and so have weights that are all 0,
-    in case another motion left them at other values."""
+    """Add channels for what moves in any motion: joints that leave their transform at rest, and the weights of the
+    correctives. The expressions and physiques that follow the correctives, up to `shapes` in all, have weight 0. Joints
+    that stay at rest in this motion have two keys, the first and the last, and so have weights that are all 0, in case
+    another motion left them at other values. in_this, in_any (J, 2): what `_moved` finds in one and in all motions."""
     animation = gltf.Animation(name=name, channels=[], samplers=[])
     seconds = ((motion.codes - motion.codes[0]) / motion.fps).astype(np.float32)
     times = cache(lambda step: writer.accessor(seconds[::step]))
@@ -194,13 +195,12 @@ def _animation(
         target = gltf.AnimationChannelTarget(node=node, path=path)
         animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
 
-    still = ~_moved(motion, skeleton)
-    for joint, kind in np.argwhere(moved).tolist():
+    for joint, kind in np.argwhere(in_any).tolist():
         path, values = (("translation", motion.translations_m), ("rotation", motion.quaternions))[kind]
-        animate(joint, path, values[:, joint], still[joint, kind])
+        animate(joint, path, values[:, joint], not in_this[joint, kind])
     if motion.shape_weights.size:
         weights = np.pad(motion.shape_weights, ((0, 0), (0, shapes - motion.shape_weights.shape[1])))
-        animate(len(skeleton.names), "weights", weights, not weights.any())
+        animate(len(in_any), "weights", weights, not weights.any())
     return animation
 
 

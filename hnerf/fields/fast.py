@@ -30,7 +30,7 @@ SHELL_MARGIN_M = 0.012  # for later movement of the surface, and for poses that 
 TIGHTEN_STEP_M = 0.004
 ELASTIC_M = 0.01  # displacement whose elastic energy is 1
 SPACING_M = 0.012  # between rendered samples; twice as many gain 0.05 dB on valid-wave for twice the time
-SPACING_PX, LEAST_SPACING_M = 4, 0.003  # in close-ups, where fingers would have fringes, and ears speckles
+SPACING_PX, MIN_SPACING_M = 4, 0.003  # in close-ups, where fingers would have fringes, and ears speckles
 SAMPLE_COUNTS = (6, 12, 18, 24, 36, 64, 128)  # a ray gets the smallest sufficient number, or the last
 HALF_SAMPLES_UNTIL = 0.75  # of the training: as accurate on three captures, in three quarters of the time
 MAX_NEIGHBOUR_DISTANCE_M = 0.03  # canonical; neighbours on a ray that are farther apart lie on different limbs
@@ -222,7 +222,7 @@ class FastField(Field):
         length_m, start_m = scene.region.path_m(rays)
         spacing_m = torch.full_like(start_m, SPACING_M)
         if scene.pixel_rad is not None:
-            spacing_m = (SPACING_PX * scene.pixel_rad * start_m).clamp(LEAST_SPACING_M, SPACING_M)
+            spacing_m = (SPACING_PX * scene.pixel_rad * start_m).clamp(MIN_SPACING_M, SPACING_M)
         needed = length_m / spacing_m
         steps = torch.tensor(SAMPLE_COUNTS, device=needed.device)
         enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLE_COUNTS) - 1)
