@@ -1,30 +1,37 @@
 """Test the automatic settings: train with twice and half of each.
 
-usage: python benchmarks/budget.py STORE [CAPTURE ...]
+usage: python benchmarks/budget.py STORE OUT [CAPTURE ...] [--preset NAME] [--at-once N]
 
-Trains preset `fast` on shared captures (default: the three rendered ones) with the settings that
-hnerf/training/auto_settings.py chooses, three times with different seeds; then with twice and half of one setting at a
-time: cells of the grids, samples a ray, nodes, width of the pose code and of the layers, rays a step, steps, and steps
-on novel frames. Scores a few held-out images by the evaluation protocol. Reuses what is in STORE. Writes
-`benchmarks/results/budget.json` and `.md`, where other captures keep their results.
+Trains shared captures (default: the three rendered ones), whose stages up to the body fit are in STORE, with the
+settings that hnerf/training/auto_settings.py chooses, three times with different seeds; then with twice and half of one
+setting at a time: cells of the grids, samples a ray, nodes, width of the pose code and of the layers, rays a step,
+steps, and steps on novel frames. Scores a few held-out images by the evaluation protocol. Training and scoring are
+those of the pipeline's stages, without Prefect. Reuses what is in OUT. Writes `benchmarks/results/budget.json` and
+`.md`, where other captures keep their results.
 """
 
 import json
+import shutil
+from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from provenance import RESULTS, SHARED, provenance, provenance_line, store_and_captures, table, write_result
+import torch
+from provenance import RESULTS, SHARED, arguments, log_progress, provenance, provenance_line, table, write_result
 
-from flows.preparation import prepare_training
-from hnerf.config import Settings, TrainingSettings, load_settings, overridden
+from hnerf.avatar.finished import recording_of
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
+from hnerf.config import TrainingSettings, load_settings, overridden
+from hnerf.evaluation.ground_truth import truth_of
 from hnerf.study.benchmark.plan import ScoringSettings
+from hnerf.study.benchmark.scoring import ScoringScene, score
 from hnerf.tables import pick, shown
-from tasks.benchmark import score_training
-from tasks.capture import ingest
-from tasks.source import read_capture
-from tasks.store import Store
-from tasks.training import train
+from hnerf.training.auto_settings import SceneStatistics, decide
+from hnerf.training.trainer import train
 
 CAPTURES = ["valid-wave", "valid-walk", "valid-turn-mono"]
 DECIDED = "as decided"
@@ -54,41 +61,70 @@ SCORING = ScoringSettings(images=8, meshes=1, snapshot_images=1, snapshot_meshes
 
 def main() -> None:
     """Train and score all variants of all captures, print and write."""
-    options = store_and_captures(__doc__, CAPTURES)
+    parser = arguments(__doc__)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("captures", nargs="*", default=CAPTURES, metavar="CAPTURE")
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--at-once", type=int, default=1, metavar="N", help="trainings at a time (default: 1)")
+    options = parser.parse_args()
     where, found = provenance(), RESULTS / "budget.json"
+    where |= {"preset": options.preset, "at_once": options.at_once}
     captures = json.loads(found.read_text())["captures"] if found.exists() else {}
-    for name in options.captures:
-        captures[name] = where | measure(SHARED / "data" / name, Store(options.store.resolve()))
-        write_result("budget", {"captures": captures}, as_markdown(captures))
+    settings = load_settings(options.preset).training
+    with ProcessPoolExecutor(options.at_once, get_context("spawn"), initializer=start_process) as processes:
+        subjects = {name: options.store / "subjects" / name for name in options.captures}
+        started = {name: start(subject, settings, options.out, processes) for name, subject in subjects.items()}
+        for name, trainings in started.items():
+            captures[name] = where | measure(trainings, options.out / name)
+            write_result("budget", {"captures": captures}, as_markdown(captures))
 
 
-def measure(folder: Path, store: Store) -> dict[str, Any]:
-    """Return the automatic settings for a capture with their reasons, and the scores of each variant."""
-    settings = load_settings("fast")
-    decided, scores = train_and_score(folder, store, settings)
-    variants = {DECIDED: scores}
-    changed = {f"{DECIDED}, seed {seed}": decided.model_copy(update={"seed": seed}) for seed in SEEDS}
+def start_process() -> None:
+    """Prepare a process that shares the machine's cores with others."""
+    torch.set_num_threads(1)
+    log_progress()
+
+
+def start(subject: Path, settings: TrainingSettings, out: Path, processes: ProcessPoolExecutor) -> dict[str, Future]:
+    """Start the trainings of a subject; return their scores to come, by variant."""
+    decided = decide(SceneStatistics.of(*prepared(subject)), settings)[0]
+    variants = {DECIDED: settings}
+    variants |= {f"{DECIDED}, seed {seed}": decided.model_copy(update={"seed": seed}) for seed in SEEDS}
     for part, keys in PARTS.items():
-        changed |= {f"{name} the {part}": scaled(decided, keys, by) for name, by in (("twice", 2.0), ("half", 0.5))}
-    for name, training in changed.items():
-        if training != decided:  # a capture may have no nodes
-            variants[name] = train_and_score(folder, store, settings.model_copy(update={"training": training}))[1]
-    reasons = variants[DECIDED].pop("decisions")
-    figures = {name: {key: pick(f, place) for key, (place, *_) in COLUMNS.items()} for name, f in variants.items()}
-    return {"decisions": reasons, "variants": figures}
+        variants |= {f"{name} the {part}": scaled(decided, keys, by) for name, by in (("twice", 2.0), ("half", 0.5))}
+    return {
+        name: processes.submit(train_and_score, subject, training, out / subject.name / name)
+        for name, training in variants.items()
+        if training != decided  # a subject may have no nodes
+    }
 
 
-def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[TrainingSettings, dict[str, Any]]:
-    """Return the training's settings with all automatic ones filled in, and its scores, together with the reasons for
-    these settings."""
-    source, truth = read_capture(folder)
-    recording = ingest(store, source, settings.capture)
-    prepared = prepare_training(store, recording, settings)
-    model = train(store, *prepared, settings.training)
-    scores = score_training(store, truth, recording, prepared.calibration, prepared.body, model, SCORING)
-    stored = json.loads((model.root / "settings.json").read_text())
-    found = json.loads((scores.root / "scores.json").read_text())
-    return TrainingSettings.model_validate(stored["training"]), found | {"decisions": stored["decisions"]}
+def measure(trainings: dict[str, Future], out: Path) -> dict[str, Any]:
+    """Return a subject's automatic settings with their reasons, and the scores of each variant."""
+    found = {name: training.result() for name, training in trainings.items()}
+    figures = {name: {key: pick(f, place) for key, (place, *_) in COLUMNS.items()} for name, f in found.items()}
+    stored = json.loads((out / DECIDED / "training" / "settings.json").read_text())
+    return {"decisions": stored["decisions"], "variants": figures}
+
+
+def train_and_score(subject: Path, settings: TrainingSettings, out: Path) -> dict[str, Any]:
+    """Return the scores of a training, unless they are in `out` already."""
+    training, scored = out / "training", out / "scores" / "scores.json"
+    if not scored.exists():
+        capture, masks, body = prepared(subject)
+        training.mkdir(parents=True, exist_ok=True)
+        train(capture, masks, body, settings, training)  # goes on where it stopped
+        truth = truth_of(SHARED / "data" / subject.name, capture)
+        shutil.rmtree(scored.parent, ignore_errors=True)
+        scored.parent.mkdir()
+        score(ScoringScene(capture, body, truth), training, SCORING, scored.parent)
+    return dict(json.loads(scored.read_text()))
+
+
+def prepared(subject: Path) -> tuple[Capture, Masks, BodyFit]:
+    """Return the recording with calibrated cameras, the masks and the body fit of a store's subject."""
+    return recording_of(subject), Masks.load(subject / "segmentation"), BodyFit.load(subject / "fit")
 
 
 def scaled(training: TrainingSettings, keys: tuple[str, ...], factor: float) -> TrainingSettings:
@@ -108,7 +144,8 @@ def as_markdown(captures: dict[str, Any]) -> str:
     lines = ["# Settings chosen from the scene"]
     for name, found in captures.items():
         decisions = [[key, f"{d['value']}", d["reason"]] for key, d in found["decisions"].items()]
-        lines += ["", f"## {name}", "", provenance_line(found)]
+        how = f"Preset `{found['preset']}`; trainings at a time, which lengthens their seconds: {found['at_once']}."
+        lines += ["", f"## {name}", "", provenance_line(found), "", how]
         lines += ["", *table([["setting", "value", "reason"], *decisions]), ""]
         titles = ["", *(title for _, title, _ in COLUMNS.values())]
         lines += table([titles, *([title, *cells(row)] for title, row in found["variants"].items())])

@@ -135,7 +135,7 @@ REGISTRY = (
         )
     ),
     study("benchmark", "pose-distance", "fast", "neural-body", seconds=120, synth=(SMALL, *LONG_WALK)),
-    measured("budget", "budget.py", "{store}", captures=RENDERED, configs=("fast",)),
+    measured("budget", "budget.py", "{store}", "{new}", captures=RENDERED, configs=("fast",)),
     on_gpu("valid-wave", "fast", "evaluation.max_images=40"),
     on_gpu("valid-walk", "fast-gpu", "evaluation.max_images=12", "evaluation.max_meshes=2"),
     on_gpu(

@@ -14,7 +14,7 @@ PROGRAMS = sorted({result.command[0].removesuffix(".py") for result in REGISTRY}
 STORE = ("store",)
 REFUSED = 77  # not an exit code of argparse
 POSITIONAL = {  # arguments of programs that need some
-    "budget": STORE,
+    "budget": (*STORE, "out"),
     "fit": STORE,
     "gpu": ("subject", "capture", "out"),
     "limits": STORE,
