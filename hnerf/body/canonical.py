@@ -6,6 +6,7 @@ not.
 """
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -90,7 +91,6 @@ class PosedBodies:
         self.rig = rig
         self._canonical_m = canonical_m
         self._free = torch.nonzero(rig.free)[:, 0]
-        self._subtree_weights = _subtree_weights(rig, self._free)
         self._skin_joints = rig.skin_joints.int()
         self._pose(theta, root)
         self._meshes = BodyMeshes(self.vertices_m, rig.faces)
@@ -223,6 +223,15 @@ class PosedBodies:
         on_edge = edge * along * (along * moved.index_select(0, cornered)).sum(-1, keepdim=True)
         return on_face.index_copy(0, cornered, on_edge)
 
+    @cached_property
+    def _subtree_weights(self) -> Tensor:
+        """Return the skin weight of each free joint with all its descendants, (V, free + 1); the last column is the
+        root's, 1."""
+        rig, dense = self.rig, self.rig.dense_weights.clone()
+        for joint in range(len(rig.joints_m) - 1, 0, -1):
+            dense[:, rig.parents[joint]] += dense[:, joint]
+        return torch.cat([dense[:, self._free], dense.new_ones(len(dense), 1)], 1)
+
     def _displacement(self, points_m: Tensor, frame: Tensor, nearest: Tensor, correction: PoseCorrection) -> Tensor:
         """Return how far the correction carries the body at each point, whose nearest vertex is `nearest` (N,): (N, 3)
         metres."""
@@ -301,12 +310,3 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
     """Return the axis-angle (..., 3) in radians of rotations (..., 3, 3), at most a half turn; without a gradient."""
     turns = Rotation.from_matrix(rotation.detach().cpu().double().reshape(-1, 3, 3).numpy()).as_rotvec()
     return torch.from_numpy(turns).to(rotation).view(rotation.shape[:-1])
-
-
-def _subtree_weights(rig: Rig, free: Tensor) -> Tensor:
-    """Return the skin weight of each free joint with all its descendants, (V, free + 1); the last column is the root's,
-    1."""
-    dense = rig.dense_weights.clone()
-    for joint in range(len(rig.joints_m) - 1, 0, -1):
-        dense[:, rig.parents[joint]] += dense[:, joint]
-    return torch.cat([dense[:, free], dense.new_ones(len(dense), 1)], 1)

@@ -66,7 +66,8 @@ def _distances_m(points_m: Tensor, limb: Tensor) -> Tensor:
     """Return the distance of points (P, 3), on limbs (P,), from the points of each limb, (P, L); infinite for a limb
     without points, and for a point's own limb."""
     near_m = points_m - NEAR_M * (points_m.mean(0) / NEAR_M).round()
-    distance_m = torch.cdist(near_m, near_m)
-    nowhere = distance_m.new_full((len(points_m), 1), torch.inf)
-    columns = [torch.cat([distance_m[:, limb == k], nowhere], 1).amin(1) for k in range(len(FIRST_JOINTS) + 1)]
-    return torch.stack(columns, 1).scatter(1, limb[:, None], torch.inf)
+    distances_m = points_m.new_full((len(points_m), len(FIRST_JOINTS) + 1), torch.inf)
+    for k in limb.unique().tolist():
+        own, others = near_m[limb == k], near_m[limb != k]
+        distances_m[limb != k, k] = torch.cdist(others, own).amin(1)
+    return distances_m
