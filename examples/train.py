@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hnerf.body.fit import fit_body
+from hnerf.calibration.calibrated import load_cameras
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.report import load_cameras
 from hnerf.capture.ingest import ingest
 from hnerf.config import SyntheticSettings, load_settings
 from hnerf.segmentation.segment import segment

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from hnerf.calibration.calibrated import load_cameras
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from tasks.stage import stage

@@ -8,7 +8,7 @@ import cv2
 from safetensors import SafetensorError
 
 from hnerf.avatar.trained import TrainedAvatar, load_avatar, stored_settings
-from hnerf.calibration.report import load_cameras
+from hnerf.calibration.calibrated import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
 from hnerf.errors import InputError, one_line

@@ -1,4 +1,4 @@
-"""Calibration report: numbers, reasons in words, plots, and the cameras to use."""
+"""Calibration report: numbers, reasons in words, plots, and the cameras to use (calibrated.py reads them)."""
 
 import dataclasses
 import json
@@ -12,10 +12,8 @@ from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.picture import draw_cameras
 from hnerf.calibration.sheet import draw_evidence
 from hnerf.calibration.synchronise import Timing
-from hnerf.capture.capture import Capture, checked_capture
-from hnerf.capture.formats.easymocap import read_easymocap, write_easymocap
+from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
-from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 DECIMALS = 4  # of pixels, metres, frames and shares: a tenth of a millimetre, far below what is measured
@@ -127,22 +125,3 @@ def _rounded(tree: Any) -> Any:
     if isinstance(tree, float):
         return round(tree, DECIMALS) + 0.0 if math.isfinite(tree) else None  # + 0.0 turns -0.0 into 0.0
     return tree
-
-
-def load_cameras(out: Path, capture: Capture) -> Capture:
-    """Return the capture with the cameras that `save` wrote, synchronised and without rejected training cameras. The
-    capture may have fewer cameras than were calibrated. Raises ValueError if the files are not what `save` wrote."""
-    try:
-        lenses = read_easymocap(out)
-    except InputError as error:
-        raise ValueError(error) from None
-    cameras = {
-        name: dataclasses.replace(capture.cameras[name], K=lens.K, R=lens.R, t_m=lens.t_m)
-        for name, lens in lenses.items()
-        if name in capture.cameras
-    }
-    train_cameras = tuple(name for name in capture.train_cameras if name in cameras)
-    found = json.loads((out / "report.json").read_text())["cameras"]
-    offsets = {name: found[name]["frame_offset"] for name in train_cameras if found[name]["frame_offset"]}
-    used = checked_capture(dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras))
-    return used.synchronised(offsets) if offsets else used

@@ -13,7 +13,7 @@ import torch.distributed as dist
 
 from hnerf import progress
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.report import load_cameras
+from hnerf.calibration.calibrated import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings

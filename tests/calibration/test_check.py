@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.bundle import zoomed
+from hnerf.calibration.calibrated import load_cameras
 from hnerf.calibration.check import _change_reasons, _height_notes, _rounded, check_calibration
 from hnerf.calibration.diagnosis import (
     MISTAKES,
@@ -17,7 +18,6 @@ from hnerf.calibration.diagnosis import (
     size_ratio,
     trimmed_cost_px,
 )
-from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from hnerf.calibration.calibrated import load_cameras
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import measure
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.matches import Matches
-from hnerf.calibration.report import load_cameras
 from hnerf.calibration.sheet import _scatter, draw_evidence
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.capture.capture import Capture

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from hnerf.calibration import synchronise as synchronise_module
+from hnerf.calibration.calibrated import load_cameras
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.report import load_cameras
 from hnerf.calibration.synchronise import measure_timing, synchronise, synchronise_capture
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
