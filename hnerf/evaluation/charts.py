@@ -1,6 +1,7 @@
 """Charts of the training history and of scores by frame, as PNG files."""
 
 from collections import defaultdict
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +31,7 @@ def quality_chart(history: list[dict[str, Any]], path: Path) -> bool:
     """Draw the PSNR on held-out frames over training time. Return whether there was one to draw and the file was
     written."""
     points = [(record["seconds"], record["held_out"]["psnr"]) for record in history if "held_out" in record]
-    if points:
-        figure, axes = _figure()
-        _line(axes, points, COLOURS[0], None)
-        _finish(axes, "seconds of training", "held-out psnr")
-        figure.savefig(path, facecolor="white")
-    return bool(points)
+    return _chart(path, {"": points} if points else {}, "seconds of training", "held-out psnr")
 
 
 def frame_chart(per_image: list[ImageScores], path: Path) -> bool:
@@ -44,35 +40,26 @@ def frame_chart(per_image: list[ImageScores], path: Path) -> bool:
     series: dict[str, Points] = defaultdict(list)
     for score in per_image:
         series[f"camera {score['camera']}"].append((score["frame"], score["psnr"]))
-    return _chart(path, series, "frame", "PSNR, dB", "linear")
+    return _chart(path, series, "frame", "PSNR, dB")
 
 
-def _chart(path: Path, series: dict[str, Points], x_label: str, y_label: str, scale: str) -> bool:
+def _chart(path: Path, series: dict[str, Points], x_label: str, y_label: str, scale: str = "linear") -> bool:
+    """Draw a line for each series; the legend has their names, unless the only one has none. Return whether there was
+    one to draw and the file was written."""
     if not series:
         return False
-    figure, axes = _figure()
-    for k, (name, points) in enumerate(series.items()):
-        _line(axes, points, COLOURS[k % len(COLOURS)], name)
-    axes.set_yscale(scale)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=9, labelcolor=INK)
-    _finish(axes, x_label, y_label)
-    figure.savefig(path, facecolor="white")
-    return True
-
-
-def _figure() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(9.6, 3.4), dpi=150, layout="constrained")
-    return figure, figure.subplots()
-
-
-def _line(axes: Axes, points: Points, colour: str, label: str | None) -> None:
-    x, y = zip(*points, strict=True)
-    axes.plot(x, y, color=colour, linewidth=1.6, marker="o" if len(points) < 40 else None, markersize=3, label=label)
-
-
-def _finish(axes: Axes, x_label: str, y_label: str) -> None:
+    axes = figure.subplots()
+    for colour, (name, points) in zip(cycle(COLOURS), series.items(), strict=False):
+        marker = "o" if len(points) < 40 else None
+        axes.plot(*zip(*points, strict=True), color=colour, linewidth=1.6, marker=marker, markersize=3, label=name)
+    axes.set_yscale(scale)
+    if any(series):
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=9, labelcolor=INK)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     style(axes, x_label, y_label)
+    figure.savefig(path, facecolor="white")
+    return True
 
 
 def style(axes: Axes, x_label: str, y_label: str) -> None:
