@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import trimesh
 
+from hnerf.asset.skeleton import UP
 from hnerf.asset.splat_rendering import render_splats
 from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.srgb import to_linear, to_srgb
@@ -20,14 +21,8 @@ PAPER, LINE = np.array([236.0, 233, 228]), np.array([47.0, 111, 181])
 def turntable_cameras(points_m: np.ndarray, facing: np.ndarray, count: int) -> list[Camera]:
     """Return level cameras around a person, evenly spaced from the front. points_m (N, 3): the surface, Y up; facing
     (3,): where the person looks."""
-    heading_rad = np.arctan2(facing[0], facing[2])
-    cameras = []
-    for angle_rad in heading_rad + np.arange(count) * 2 * np.pi / count:
-        c, s = np.cos(angle_rad), np.sin(angle_rad)
-        upright = np.eye(4)  # a body with Z up, facing -Y
-        upright[:3, :3] = np.array([[c, 0, -s], [-s, 0, -c], [0, 1, 0]]).T
-        cameras.append(portrait_camera(points_m, upright, "front"))
-    return cameras
+    headings_rad = np.arctan2(facing[0], facing[2]) + np.arange(count) * 2 * np.pi / count
+    return [portrait_camera(points_m, np.array([-np.sin(h), 0, -np.cos(h)]), UP) for h in headings_rad]
 
 
 def textured(shot: Shot, avatar: StagedAvatar) -> np.ndarray:

@@ -96,7 +96,9 @@ def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None
     """Return a mesh's row: the mesh from the person's front and back, followed by the true mesh and the distance
     between them. root (4, 4)."""
     points_m = mesh.vertices if truth is None else np.concatenate([mesh.vertices, truth.vertices])
-    cameras = {side: pictures.portrait_camera(points_m, root, side) for side in ("front", "back")}
+    ahead, up = root[:3, 1], root[:3, 2]  # the body faces -Y
+    sides = {"front": ahead, "back": -ahead}
+    cameras = {side: pictures.portrait_camera(points_m, towards, up) for side, towards in sides.items()}
     surface = Surface(mesh)
     shots = {side: pictures.shoot(surface, camera) for side, camera in cameras.items()}
     row = [(f"Surface, {side}", pictures.clay(shot)) for side, shot in shots.items()]

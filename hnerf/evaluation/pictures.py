@@ -143,22 +143,17 @@ def distance_map(shot: Shot, truth: Surface) -> np.ndarray:
     return shot.averaged(colours * studio_light(shot))
 
 
-def portrait_camera(points_m: np.ndarray, root: np.ndarray, side: str) -> Camera:
-    """Return a camera of long focal length that looks at a person's "front" or "back", framing the surface points (N,
-    3).
-
-    root (4, 4): world from body, whose axes are Z up, facing -Y.
-    """
+def portrait_camera(points_m: np.ndarray, ahead: np.ndarray, up: np.ndarray) -> Camera:
+    """Return a camera of long focal length that looks along a direction (3,) at surface points (N, 3) and frames them;
+    up (3,): at right angles to it."""
     width_px, height_px = PICTURE_PX
-    towards = root[:3, 1] if side == "front" else -root[:3, 1]
-    down = -root[:3, 2]
-    R = np.stack([np.cross(down, towards), down, towards])
+    R = np.stack([np.cross(ahead, up), -up, ahead])
     x = points_m @ R.T
     middle, half = (x.max(0) + x.min(0)) / 2, (x.max(0) - x.min(0)) / 2
     distance_m = 5.0 + half[2]
     focal_px = 0.47 * min(width_px / half[0], height_px / half[1]) * (distance_m - half[2])
     K = np.array([[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]])
-    return Camera(side, K, R, np.array([0, 0, distance_m]) - middle, width_px, height_px)
+    return Camera("portrait", K, R, np.array([0, 0, distance_m]) - middle, width_px, height_px)
 
 
 def cast_pixels(surface: Surface, camera: Camera) -> RayHits:

@@ -36,8 +36,8 @@ def test_the_error_map_goes_from_dark_to_bright_and_saturates() -> None:
 def test_portraits_show_the_front_and_the_back() -> None:
     front_m, back_m = np.array([0.3, -0.2, 0.0]), np.array([-0.3, 0.2, 1.0])  # facing -Y, Z up
     points_m = np.stack([front_m, back_m])
-    for side, nearer, further in (("front", front_m, back_m), ("back", back_m, front_m)):
-        camera = pictures.portrait_camera(points_m, np.eye(4), side)
+    for ahead, nearer, further in (([0.0, 1, 0], front_m, back_m), ([0.0, -1, 0], back_m, front_m)):
+        camera = pictures.portrait_camera(points_m, np.array(ahead), np.array([0.0, 0, 1]))
         (_, low_px), (_, high_px) = (camera.project(p)[0] for p in points_m)
         assert camera.project(nearer)[1] < camera.project(further)[1]
         assert 0 < high_px < 40 and 360 < low_px < 400  # head up, filling 94 % of 400 px
@@ -45,7 +45,7 @@ def test_portraits_show_the_front_and_the_back() -> None:
 
 def test_the_distance_map_shows_the_distance_to_the_truth() -> None:
     ball = trimesh.creation.icosphere(3, 0.3)
-    camera = pictures.portrait_camera(ball.vertices, np.eye(4), "front")
+    camera = pictures.portrait_camera(ball.vertices, np.array([0.0, 1, 0]), np.array([0.0, 0, 1]))
     surface, far = Surface(ball), Surface(trimesh.creation.icosphere(3, 0.3 + pictures.FULL_DISTANCE_M))
     shot = pictures.shoot(surface, camera)
     same, off = (pictures.distance_map(shot, truth)[200, 150].astype(float) for truth in (surface, far))
