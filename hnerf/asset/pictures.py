@@ -100,11 +100,6 @@ def _to_edge_m(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
     return (hits.barycentric[met] * heights_m).min(1)
 
 
-def texture_picture(texture: np.ndarray, side_px: int) -> np.ndarray:
-    """Return a texture scaled to a square."""
-    return cv2.resize(texture, (side_px, side_px), interpolation=cv2.INTER_AREA)
-
-
 def uv_picture(avatar: StagedAvatar, side_px: int) -> np.ndarray:
     """Draw the faces in the square of texture coordinates, on white."""
     picture = np.full((side_px, side_px, 3), 255, np.uint8)

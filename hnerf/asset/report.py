@@ -10,11 +10,11 @@ import numpy as np
 
 from hnerf.asset.comparison import Compared
 from hnerf.asset.extreme_poses import ExtremePose
-from hnerf.asset.pictures import texture_picture, textured, turntable_cameras, uv_picture, wireframe
+from hnerf.asset.pictures import textured, turntable_cameras, uv_picture, wireframe
 from hnerf.asset.skeleton import FRONT
 from hnerf.asset.staging import StagedAvatar
-from hnerf.evaluation.galleries import GalleryPicture
-from hnerf.evaluation.pictures import clay, data_uri, shoot
+from hnerf.evaluation.galleries import GalleryPicture, captioned
+from hnerf.evaluation.pictures import clay, shoot, shrunk
 from hnerf.evaluation.report import report_environment
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
@@ -24,7 +24,7 @@ from hnerf.side_by_side import side_by_side
 TEMPLATES = Path(__file__).parent / "page"
 TURNS = 8  # views of the turntable
 COMPARED = 3  # views shown next to the field's
-SQUARE_PX = 640  # of the texture and its layout
+SQUARE_PX = 640  # of the layout, and at most of the texture
 
 
 def write_report(
@@ -50,17 +50,17 @@ def write_report(
             name=name,
             frame=frame,
             has_viewer=(path.parent / "viewer.html").exists(),
-            turntable=[_picture(f"{round(360 * k / TURNS)}°", textured(shot, avatar)) for k, shot in enumerate(shots)],
+            turntable=[captioned(f"{round(360 * k / TURNS)}°", textured(shot, avatar)) for k, shot in enumerate(shots)],
             surface=[
-                _picture("Clay, front", clay(front)),
-                _picture("Clay, back", clay(back)),
-                _picture("Wireframe, front", wireframe(front)),
-                _picture("Wireframe, back", wireframe(back)),
+                captioned("Clay, front", clay(front)),
+                captioned("Clay, back", clay(back)),
+                captioned("Wireframe, front", wireframe(front)),
+                captioned("Wireframe, back", wireframe(back)),
                 *_less_detail(avatar, points_m, front.camera),
             ],
             texture=[
-                _picture("Texture", texture_picture(avatar.texture, SQUARE_PX)),
-                _picture("Layout", uv_picture(avatar, SQUARE_PX)),
+                captioned("Texture", shrunk(avatar.texture, SQUARE_PX)),
+                captioned("Layout", uv_picture(avatar, SQUARE_PX)),
                 *_without_light(avatar),
             ],
             against_field=[_beside_field(view) for view in evenly_spaced(compared, COMPARED)],
@@ -75,9 +75,9 @@ def _beside_field(view: Compared) -> list[GalleryPicture]:
     """Return the photograph of a view and all its renders, with their PSNR."""
     captions = {"field": "Field", "asset": "Captured look", "albedo": "Albedo in its light", "splats": "Splats"}
     return [
-        _picture(f"Photograph, camera {view.view.camera}, frame {view.view.frame}", view.photograph),
+        captioned(f"Photograph, camera {view.view.camera}, frame {view.view.frame}", view.photograph),
         *(
-            _picture(f"{captions[name]}, {view.scores[name]['psnr']:.1f} dB", render[..., :3])
+            captioned(f"{captions[name]}, {view.scores[name]['psnr']:.1f} dB", render[..., :3])
             for name, render in view.renders.items()
         ),
     ]
@@ -86,7 +86,7 @@ def _beside_field(view: Compared) -> list[GalleryPicture]:
 def _less_detail(avatar: StagedAvatar, points_m: np.ndarray, camera: Camera) -> list[GalleryPicture]:
     """Return the wireframe of each lower level of detail."""
     shots = [shoot(Surface.of(points_m[lv.vertices], lv.faces), camera) for lv in avatar.levels[1:]]
-    return [_picture(f"lod{k}, {len(shot.mesh.faces)} triangles", wireframe(shot)) for k, shot in enumerate(shots, 1)]
+    return [captioned(f"lod{k}, {len(shot.mesh.faces)} triangles", wireframe(shot)) for k, shot in enumerate(shots, 1)]
 
 
 def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:
@@ -95,8 +95,8 @@ def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:
         return []
     light = cv2.resize(avatar.albedo.dome[0], (SQUARE_PX, SQUARE_PX // 2))
     return [
-        _picture("Albedo", texture_picture(avatar.albedo.texture, SQUARE_PX)),
-        _picture("Estimated light, +Z in the middle, +X left of it", light),
+        captioned("Albedo", shrunk(avatar.albedo.texture, SQUARE_PX)),
+        captioned("Estimated light, +Z in the middle, +X left of it", light),
     ]
 
 
@@ -105,10 +105,6 @@ def _extreme(avatar: StagedAvatar, pose: ExtremePose) -> list[GalleryPicture]:
     camera = turntable_cameras(pose.points_m[pose.shown], FRONT, 1)[0]
     shot = shoot(Surface.of(pose.points_m, avatar.faces), camera)
     return [
-        _picture(f"{pose.name}: {100 * pose.crossing:.1f} % of faces cross", clay(shot)),
-        _picture(pose.name, textured(shot, avatar)),
+        captioned(f"{pose.name}: {100 * pose.crossing:.1f} % of faces cross", clay(shot)),
+        captioned(pose.name, textured(shot, avatar)),
     ]
-
-
-def _picture(caption: str, picture: np.ndarray) -> GalleryPicture:
-    return GalleryPicture(caption, data_uri(picture))

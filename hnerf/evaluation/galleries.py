@@ -75,7 +75,7 @@ def view_row(
         caption, cut_reference = reference[0], pictures.crop(reference[1], box)
         row += [(caption, cut_reference), ("Error", pictures.error_map(cut_rendered, cut_reference))]
     row += [(caption, pictures.crop(other[..., :3], box)) for caption, other in others.items()]
-    return Row(f"Frame {view.frame}, camera {view.camera}", note, _captioned(row))
+    return Row(f"Frame {view.frame}, camera {view.camera}", note, [captioned(*picture) for picture in row])
 
 
 def _mask_and_reference(
@@ -107,8 +107,9 @@ def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None
         true_shots = {side: pictures.shoot(true_surface, camera) for side, camera in cameras.items()}
         row += [(f"Ground truth, {side}", pictures.clay(shot)) for side, shot in true_shots.items()]
         row += [(f"Distance, {side}", pictures.distance_map(shot, true_surface)) for side, shot in shots.items()]
-    return Row(f"Frame {frame}", note, _captioned(row))
+    return Row(f"Frame {frame}", note, [captioned(*picture) for picture in row])
 
 
-def _captioned(row: list[tuple[str, np.ndarray]]) -> list[GalleryPicture]:
-    return [GalleryPicture(caption, pictures.data_uri(picture)) for caption, picture in row]
+def captioned(caption: str, picture: np.ndarray) -> GalleryPicture:
+    """Return an image (H, W, 3) uint8 with its caption."""
+    return GalleryPicture(caption, pictures.data_uri(picture))

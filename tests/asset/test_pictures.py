@@ -7,7 +7,7 @@ from hnerf.asset import pictures
 from hnerf.asset.levels import Level
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.texture import UvLayout
-from hnerf.evaluation.pictures import shoot
+from hnerf.evaluation.pictures import shoot, shrunk
 from hnerf.geometry.mesh_queries import Surface
 
 RED, GREEN, BLUE = [255, 0, 0], [0, 255, 0], [0, 0, 255]
@@ -61,4 +61,4 @@ def test_the_layout_shows_where_faces_lie_in_the_texture(card: StagedAvatar) -> 
     layout = pictures.uv_picture(lower, 64)
     assert layout[10, 32].tolist() == [255, 255, 255]
     assert layout[60, 40].tolist() == pictures.PAPER.tolist()
-    assert pictures.texture_picture(card.texture, 32)[4, 4].tolist() == RED
+    assert shrunk(card.texture, 32)[4, 4].tolist() == RED

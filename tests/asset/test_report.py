@@ -20,7 +20,7 @@ def test_every_picture_has_its_caption(staged: StagedAvatar, tmp_path: Path, mon
     """Textures and renders are each of one grey level; the addresses of pictures are those of their first pixels."""
     monkeypatch.setattr(report, "TURNS", 2)
     monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))
-    monkeypatch.setattr(report, "data_uri", lambda picture: str(picture[0, 0, 0]))
+    monkeypatch.setattr("hnerf.evaluation.pictures.data_uri", lambda picture: str(picture[0, 0, 0]))
     assert staged.albedo is not None
     avatar = dataclasses.replace(staged, texture=grey(50, 3), albedo=Albedo(grey(60, 3), staged.albedo.light))
     levels = {"field": 10, "asset": 20, "albedo": 30, "splats": 40}
