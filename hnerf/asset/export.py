@@ -124,7 +124,6 @@ def export_asset(
         packages = ["avatar.usdz", "avatar.usda", *resampled, "avatar_cache.usdz", *([SPLATS] if splats else [])]
         validation = {name: validate_package(out / name) for name in packages}
     report = _figures(capture, meshes, asset, topology, settings) | {
-        "against_field": asset.against_field,
         "crossing_share": {pose.name: pose.crossing for pose in poses},
         "viewer": viewer,
         "bytes": {str(p.relative_to(out)): p.stat().st_size for p in sorted(out.rglob("*")) if p.is_file()},
@@ -132,7 +131,7 @@ def export_asset(
         "validation": validation,
     }
     if captured:
-        report["captured"] = _captured_figures(captured)
+        report["captured"] = _mesh_asset_figures(captured, "captured") | {"seconds": captured.seconds}
     if splats:
         report["splats"] = splat_figures(staged, splats)
     (out / "report.json").write_text(json.dumps(report, indent=1))
@@ -220,14 +219,13 @@ def _figures(
     capture: Capture, meshes: RestMeshes, asset: MeshAsset, topology: str, settings: AssetSettings
 ) -> dict[str, Any]:
     """Return the figures of the surface, the rigs and the motions."""
-    surface, staged, dense = asset.surface, asset.staged, meshes.dense
+    staged, dense = asset.staged, meshes.dense
     light, motions = staged.albedo and staged.albedo.light, staged.rigs[FULL].motions
     return {
         "surface": {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume},
-        "mesh": mesh_figures(topology, surface.mesh, staged),
+        **_mesh_asset_figures(asset, topology),
         "to_surface_mm": meshes.distances_mm,
         "findings": findings(meshes.distances_mm[topology]) if topology == "registered" else [],
-        "levels": level_figures(staged),
         "texture_px": settings.texture_px,
         "normal_map_px": settings.normal_map_px,
         "light": light and {"coefficients": light.coefficients.round(4).tolist(), "normals_turned_deg": light.turn_deg},
@@ -237,19 +235,18 @@ def _figures(
         "rigs": {name: rig_figures(staged, name) for name in staged.rigs},
         "motions": {name: {"fps": motion.fps, "poses": len(motion.codes)} for name, motion in motions.items()},
         "frames": len(capture.frames),
-        "beyond_skinning_mm": beyond_skinning_mm(surface.displacements_m, surface.correctives),
         "cameras": len(capture.cameras),
     }
 
 
-def _captured_figures(asset: MeshAsset) -> dict[str, Any]:
-    """Return the figures of the captured mesh, which are reported next to the registered one's."""
+def _mesh_asset_figures(asset: MeshAsset, topology: str) -> dict[str, Any]:
+    """Return the figures in which the assets of two meshes differ."""
+    surface = asset.surface
     return {
-        "mesh": mesh_figures("captured", asset.surface.mesh, asset.staged),
+        "mesh": mesh_figures(topology, surface.mesh, asset.staged),
         "levels": level_figures(asset.staged),
-        "beyond_skinning_mm": beyond_skinning_mm(asset.surface.displacements_m, asset.surface.correctives),
+        "beyond_skinning_mm": beyond_skinning_mm(surface.displacements_m, surface.correctives),
         "against_field": asset.against_field,
-        "seconds": asset.seconds,
     }
 
 
