@@ -10,11 +10,11 @@ from pxr import Usd, UsdGeom, UsdSkel, UsdValidation, UsdVol
 
 from hnerf.asset.package_checks import package_defects
 from hnerf.asset.rig_checks import animation_defects, samples, skeleton_defects, skin_defects
-from hnerf.asset.splat_checks import splat_defects
 from hnerf.asset.staging import box
 from hnerf.errors import InvalidAsset
 
 PLAUSIBLE_SIZE_M = (0.4, 3.0)  # longest side of the box around a person at rest; capture.toml takes 0.5 m to 2.5 m
+UNIT = 5e-3  # by which the length of a half-precision quaternion may differ from 1
 
 
 def validate_package(path: Path) -> dict[str, Any]:
@@ -50,25 +50,20 @@ def each_variant(stage: Usd.Stage) -> Iterator[str]:
     topologies = root.GetVariantSet("topology").GetVariantNames() if root else []
     for topology in topologies or [""]:
         stage.GetSessionLayer().Clear()
-        yield from _each_inside(root, topology)
-
-
-def _each_inside(root: Usd.Prim, topology: str) -> Iterator[str]:
-    """Select what `each_variant` describes inside a topology, if there is one. Topologies differ in their other
-    variants."""
-    if topology:
-        root.GetVariantSet("topology").SetVariantSelection(topology)
-    sets = {} if not root else {name: root.GetVariantSet(name) for name in root.GetVariantSets().GetNames()}
-    default = {name: v.GetVariantSelection() for name, v in sets.items()}
-    names = {name: [topology] if name == "topology" else v.GetVariantNames() for name, v in sets.items()}
-    for chosen in itertools.product(*names.values()):
-        further = {name for name, value in zip(names, chosen, strict=True) if value != default[name]}
-        if len(further & {"lod", "motion", "shape"}) > 1:
-            continue
-        for variants, name in zip(sets.values(), chosen, strict=True):
-            variants.SetVariantSelection(name)
-        words = " ".join(f"{name}={value}" for name, value in zip(sets, chosen, strict=True))
-        yield f"{words}: " if words else ""
+        if topology:
+            root.GetVariantSet("topology").SetVariantSelection(topology)  # topologies differ in their other variants
+        sets = {name: root.GetVariantSet(name) for name in root.GetVariantSets().GetNames()} if root else {}
+        default = {name: v.GetVariantSelection() for name, v in sets.items()}
+        names = {name: [topology] if name == "topology" else v.GetVariantNames() for name, v in sets.items()}
+        for values in itertools.product(*names.values()):
+            chosen = dict(zip(names, values, strict=True))
+            further = {name for name, value in chosen.items() if value != default[name]}
+            if len(further & {"lod", "motion", "shape"}) > 1:
+                continue
+            for name, value in chosen.items():
+                sets[name].SetVariantSelection(value)
+            words = " ".join(f"{name}={value}" for name, value in chosen.items())
+            yield f"{words}: " if words else ""
 
 
 def data_defects(stage: Usd.Stage) -> list[str]:
@@ -89,7 +84,7 @@ def data_defects(stage: Usd.Stage) -> list[str]:
                 defects += skin_defects(prim)
         elif prim.IsA(UsdVol.ParticleField3DGaussianSplat):
             found += 1
-            defects += splat_defects(prim)
+            defects += _splat_defects(prim)
         elif prim.IsA(UsdSkel.Skeleton):
             defects += skeleton_defects(UsdSkel.Skeleton(prim))
         elif prim.IsA(UsdSkel.Animation):
@@ -133,3 +128,28 @@ def _uv_defects(mesh: UsdGeom.Mesh, corners: int) -> list[str]:
     if not ((values >= 0) & (values <= 1)).all():
         return [f"{mesh.GetPath()}: texture coordinates outside [0, 1]"]
     return []
+
+
+def _splat_defects(prim: Usd.Prim) -> list[str]:
+    """Return one line for each defect of a prim of splats."""
+    splats, name = UsdVol.ParticleField3DGaussianSplat(prim), prim.GetPath()
+    scales, opacities = (np.array(a.Get() or []) for a in (splats.GetScalesAttr(), splats.GetOpacitiesAttr()))
+    coefficients = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get() or [])
+    degree, count, defects = splats.GetRadianceSphericalHarmonicsDegreeAttr().Get(), len(scales), []
+    # Negated conditions, so that NaN fails.
+    if not (count and (scales > 0).all() and np.isfinite(scales).all()):
+        defects.append(f"{name}: scales are not finite or not above 0")
+    if not (len(opacities) == count and ((opacities > 0) & (opacities <= 1)).all()):
+        defects.append(f"{name}: opacities are not one a splat, above 0 and at most 1")
+    if not (len(coefficients) == count * (degree + 1) ** 2 and np.isfinite(coefficients).all()):
+        defects.append(f"{name}: coefficients are not finite or not those of degree {degree} for each splat")
+    for time in samples(splats.GetPositionsAttr()):
+        at_m, box_m = np.array(splats.GetPositionsAttr().Get(time)), np.array(splats.GetExtentAttr().Get(time))
+        if not (len(at_m) == count and np.isfinite(at_m).all()):
+            defects.append(f"{name}: positions are not finite or not one a splat at time {time}")
+        elif not (box_m.shape == (2, 3) and (box_m[0] < at_m.min(0)).all() and (box_m[1] > at_m.max(0)).all()):
+            defects.append(f"{name}: extent does not contain the positions at time {time}")
+        turns = np.array(splats.GetOrientationshAttr().Get(time) or [], np.float32).reshape(-1, 4)
+        if not (len(turns) == count and (np.abs(np.linalg.norm(turns, axis=1) - 1) < UNIT).all()):
+            defects.append(f"{name}: orientations are not unit quaternions, one a splat, at time {time}")
+    return defects
