@@ -361,7 +361,7 @@ FAULTS = (
     Fault("splats-triangle", "asset/splats", "root = np.sqrt(", "root = ("),
     Fault("splats-spread", "asset/splats", "SPREAD = 1.4", "SPREAD = 1.3"),
     Fault("splats-logit", "asset/splat_ply", "np.log(OPACITY / (1 - OPACITY))", "OPACITY", "asset/splats"),
-    Fault("splats-quaternion", "asset/splat_prim", "[:, [1, 2, 3, 0]]", "[:, [0, 1, 2, 3]]", "asset/splats"),
+    Fault("splats-quaternion", "asset/usd", "[:, [1, 2, 3, 0]]", "[:, [0, 1, 2, 3]]", "asset/splats"),
     Fault("splats-order", "asset/splat_rendering", "np.argsort(depth_m,", "np.argsort(-depth_m,"),
     Fault("splats-hidden", "asset/splat_rendering", "through[pixel] * np.exp(before)", "np.exp(before)"),
     Fault("splats-slope", "asset/splat_rendering", "K[:2] - pixels_px[:, :, None] *", "K[:2] - 0 *"),

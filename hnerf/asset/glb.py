@@ -151,9 +151,8 @@ def _add_materials(writer: GlbWriter, avatar: StagedAvatar, primitive: gltf.Prim
     document = writer.document
     document.extensionsUsed = [SPECULAR]
     document.samplers.append(gltf.Sampler(wrapS=gltf.CLAMP_TO_EDGE, wrapT=gltf.CLAMP_TO_EDGE))
-    looks = {"captured": avatar.texture} | ({"albedo": avatar.albedo.texture} if avatar.albedo else {})
     normals = None if avatar.normal_map is None else _add_texture(writer, avatar.normal_map)
-    for name, texture in looks.items():
+    for name, texture in avatar.looks.items():
         colours = gltf.TextureInfo(index=_add_texture(writer, texture))
         matte = gltf.PbrMetallicRoughness(baseColorTexture=colours, metallicFactor=0.0, roughnessFactor=1.0)
         no_sheen = {SPECULAR: {"specularFactor": 0.0}}  # what there was is already in the colours
@@ -161,10 +160,10 @@ def _add_materials(writer: GlbWriter, avatar: StagedAvatar, primitive: gltf.Prim
         if normals is not None:
             material.normalTexture = gltf.NormalMaterialTexture(index=normals)
         document.materials.append(material)
-    if len(looks) > 1:
+    if avatar.albedo:
         document.extensionsUsed.append(VARIANTS)
-        document.extensions = {VARIANTS: {"variants": [{"name": name} for name in looks]}}
-        mappings = [{"material": k, "variants": [k]} for k in range(len(looks))]
+        document.extensions = {VARIANTS: {"variants": [{"name": name} for name in avatar.looks]}}
+        mappings = [{"material": k, "variants": [k]} for k in range(len(avatar.looks))]
         primitive.extensions = {VARIANTS: {"mappings": mappings}}
 
 

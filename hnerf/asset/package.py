@@ -14,7 +14,7 @@ import struct
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from zipfile import ZipFile, is_zipfile
@@ -22,29 +22,10 @@ from zipfile import ZipFile, is_zipfile
 import numpy as np
 from pxr import Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
+from hnerf.asset import usd
 from hnerf.asset.rigs import FULL
-from hnerf.asset.splat_prim import author_splats
 from hnerf.asset.splats import Splats
 from hnerf.asset.staging import CAPTURED, StagedAvatar, box
-from hnerf.asset.usd import (
-    ALBEDO_NAME,
-    LIGHT_NAME,
-    NORMAL_MAP_NAME,
-    ROOT,
-    TEXTURE_NAME,
-    author_albedo_look,
-    author_cameras,
-    author_captured_look,
-    author_geometry,
-    author_motion,
-    author_rig,
-    author_shape,
-    define_mesh,
-    extent,
-    physique_box,
-    surface_paths,
-    vec3f,
-)
 from hnerf.body.descriptor import normals_of
 from hnerf.capture.capture import write_image
 from hnerf.geometry.camera import Camera
@@ -75,8 +56,8 @@ class Part:
     name: str
     author: Callable[[Usd.Stage], None]
     fps: float
-    variant: Variant | None = None
-    topology: Variant | None = None
+    variant: Variant | None
+    topology: Variant | None
 
 
 def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
@@ -89,7 +70,7 @@ def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: f
     for part in parts:
         layer = Usd.Stage.CreateNew(str(folder / f"{part.name}.usdc"))
         _set_units(layer, part.fps)
-        layer.SetDefaultPrim(layer.OverridePrim(ROOT))
+        layer.SetDefaultPrim(layer.OverridePrim(usd.ROOT))
         part.author(layer)
         _save(layer)
     _write_interface(out / INTERFACE, parts, avatars, fps, info, CAPTURED)
@@ -114,21 +95,21 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
     with tempfile.TemporaryDirectory() as folder:
         layer = Path(folder) / "avatar_cache.usdc"
         stage = _new_stage(layer, path.name, {"": avatar}, avatar.frames, fps, info)
-        author_cameras(stage, cameras, avatar.stage_from_world)
-        mesh = define_mesh(stage, ROOT.AppendChild("Surface"), avatar, level=0)
-        author_captured_look(stage, [mesh.GetPath()], avatar)
+        usd.author_cameras(stage, cameras, avatar.stage_from_world)
+        mesh = usd.define_mesh(stage, usd.ROOT.AppendChild("Surface"), avatar, level=0)
+        usd.author_look(stage, "captured", [mesh.GetPath()], avatar)
         points, extents, normals = mesh.CreatePointsAttr(), mesh.CreateExtentAttr(), mesh.CreateNormalsAttr()
         for frame, posed in zip(avatar.frames, avatar.points_m, strict=True):
-            points.Set(vec3f(posed), float(frame))
-            extents.Set(extent(posed), float(frame))
-            normals.Set(vec3f(normals_of(posed, avatar.faces)), float(frame))
+            points.Set(usd.vec3f(posed), float(frame))
+            extents.Set(usd.extent(posed), float(frame))
+            normals.Set(usd.vec3f(normals_of(posed, avatar.faces)), float(frame))
         _package(stage, {"": avatar}, path)
 
 
 def write_splats(path: Path, avatar: StagedAvatar, splats: Splats, fps: float, info: AssetInfo) -> None:
     """Write `avatar_splats.usdc`: Gaussian splats on the surface at every frame."""
     stage = _new_stage(path, path.name, {"": avatar}, avatar.frames, fps, info)
-    author_splats(stage, avatar, splats)
+    usd.author_splats(stage, avatar, splats)
     _save(stage)
 
 
@@ -137,48 +118,37 @@ def _prefix(topology: str) -> str:
     return f"{topology}_" if topology else ""
 
 
-def _parts(avatars: Avatars, cameras: list[Camera], fps: float) -> list[Part]:
-    """Return the parts of the package, inside the variants of `topology` if there are several."""
-    return [
-        replace(part, name=_prefix(topology) + part.name, topology=_variant(topology))
-        for topology, avatar in avatars.items()
-        for part in _parts_of(avatar, cameras, fps, _prefix(topology))
-    ]
-
-
 def _variant(topology: str) -> Variant | None:
     return ("topology", topology) if topology else None
 
 
-def _parts_of(avatar: StagedAvatar, cameras: list[Camera], fps: float, prefix: str) -> list[Part]:
-    """Return the parts of one topology. prefix: of its images' names. Earlier parts override later ones: shapes replace
-    the extents of motions."""
-    view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
-    meshes = surface_paths(avatar)
-    looks = {"captured": author_captured_look} | ({"albedo": author_albedo_look} if avatar.albedo else {})
-    return [
-        *(
-            Part(f"shape_{name}", partial(author_shape, avatar=avatar, physique=physique), fps, ("shape", name))
-            for name, physique in {CAPTURED: None, **{name: name for name in avatar.physiques_m}}.items()
-        ),
-        *(
-            Part(f"geometry_lod{k}", partial(author_geometry, avatar=avatar, level=k), fps, ("lod", f"lod{k}"))
-            for k in range(len(avatar.levels))
-        ),
-        *(
-            Part(f"look_{name}", partial(author, meshes=meshes, avatar=avatar, prefix=prefix), fps, ("look", name))
-            for name, author in looks.items()
-        ),
-        Part("cameras", view, fps),
-        *(
-            Part(f"rig_{name}", partial(author_rig, name=name, rig=rig, levels=avatar.levels), fps, ("rig", name))
-            for name, rig in avatar.rigs.items()
-        ),
-        *(
-            Part(f"motion_{name}", partial(author_motion, name=name, avatar=avatar), motion.fps, ("motion", name))
-            for name, motion in avatar.rigs[FULL].motions.items()
-        ),
-    ]
+def _parts(avatars: Avatars, cameras: list[Camera], fps: float) -> list[Part]:
+    """Return the parts of the package, inside the variants of `topology` if there are several. Earlier parts override
+    later ones: shapes replace the extents of motions."""
+    return [part for topology, avatar in avatars.items() for part in _parts_of(topology, avatar, cameras, fps)]
+
+
+def _parts_of(topology: str, avatar: StagedAvatar, cameras: list[Camera], fps: float) -> Iterator[Part]:
+    """Yield the parts of one topology."""
+    prefix, outer = _prefix(topology), _variant(topology)
+    for name, physique in {CAPTURED: None, **{name: name for name in avatar.physiques_m}}.items():
+        author = partial(usd.author_shape, avatar=avatar, physique=physique)
+        yield Part(f"{prefix}shape_{name}", author, fps, ("shape", name), outer)
+    for level in range(len(avatar.levels)):
+        author = partial(usd.author_geometry, avatar=avatar, level=level)
+        yield Part(f"{prefix}geometry_lod{level}", author, fps, ("lod", f"lod{level}"), outer)
+    meshes = [usd.surface_path(level) for level in range(len(avatar.levels))]
+    for name in avatar.looks:
+        author = partial(usd.author_look, name=name, meshes=meshes, avatar=avatar, prefix=prefix)
+        yield Part(f"{prefix}look_{name}", author, fps, ("look", name), outer)
+    author = partial(usd.author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
+    yield Part(f"{prefix}cameras", author, fps, None, outer)
+    for name, rig in avatar.rigs.items():
+        author = partial(usd.author_rig, name=name, rig=rig, levels=avatar.levels)
+        yield Part(f"{prefix}rig_{name}", author, fps, ("rig", name), outer)
+    for name, motion in avatar.rigs[FULL].motions.items():
+        author = partial(usd.author_motion, name=name, avatar=avatar)
+        yield Part(f"{prefix}motion_{name}", author, motion.fps, ("motion", name), outer)
 
 
 @contextmanager
@@ -231,7 +201,7 @@ def _new_stage(file: Path, name: str, avatars: Avatars, codes: np.ndarray, fps: 
     _set_units(stage, fps)
     stage.SetStartTimeCode(float(codes[0]))
     stage.SetEndTimeCode(float(codes[-1]))
-    root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
+    root = UsdGeom.Xform.Define(stage, usd.ROOT).GetPrim()
     stage.SetDefaultPrim(root)
     model = Usd.ModelAPI(root)
     model.SetKind(Kind.Tokens.component)
@@ -240,7 +210,7 @@ def _new_stage(file: Path, name: str, avatars: Avatars, codes: np.ndarray, fps: 
     model.SetAssetVersion(info.version)
     for key, value in (("captureDigest", info.capture), ("licence", info.licence)):
         root.SetAssetInfoByKey(key, value)
-    UsdGeom.ModelAPI.Apply(root).SetExtentsHint(extent(np.concatenate([*map(_everywhere, avatars.values())])))
+    UsdGeom.ModelAPI.Apply(root).SetExtentsHint(usd.extent(np.concatenate([*map(_everywhere, avatars.values())])))
     return stage
 
 
@@ -255,7 +225,7 @@ def _everywhere(avatar: StagedAvatar) -> np.ndarray:
     """Return the corners (n, 3) of boxes around the surface at rest, in all motions and physiques, and in the cache."""
     corners = [box(avatar.rest_points_m), box(avatar.points_m.reshape(-1, 3))]
     corners += [boxes.reshape(-1, 3) for boxes in avatar.extents_m.values()]
-    return np.concatenate([*corners, *(physique_box(avatar, name) for name in avatar.physiques_m)])
+    return np.concatenate([*corners, *(usd.physique_box(avatar, name) for name in avatar.physiques_m)])
 
 
 def _save(stage: Usd.Stage) -> None:
@@ -278,12 +248,12 @@ def _package(stage: Usd.Stage, avatars: Avatars, path: Path) -> None:
 def _write_images(folder: Path, avatars: Avatars) -> None:
     for topology, avatar in avatars.items():
         prefix = _prefix(topology)
-        write_image(folder / f"{prefix}{TEXTURE_NAME}", avatar.texture)
+        for look, texture in avatar.looks.items():
+            write_image(folder / f"{prefix}{usd.TEXTURE_NAMES[look]}", texture)
         if avatar.albedo is not None:
-            write_image(folder / f"{prefix}{ALBEDO_NAME}", avatar.albedo.texture)
-            write_image(folder / f"{prefix}{LIGHT_NAME}", avatar.albedo.dome[0])
+            write_image(folder / f"{prefix}{usd.LIGHT_NAME}", avatar.albedo.dome[0])
         if avatar.normal_map is not None:
-            write_image(folder / f"{prefix}{NORMAL_MAP_NAME}", avatar.normal_map)
+            write_image(folder / f"{prefix}{usd.NORMAL_MAP_NAME}", avatar.normal_map)
 
 
 def _forget_times(path: Path) -> None:

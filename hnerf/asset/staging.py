@@ -92,6 +92,11 @@ class StagedAvatar:
         return {name: change.astype(np.float32) for name, change in changed.items()}
 
     @property
+    def looks(self) -> dict[str, np.ndarray]:
+        """Return the texture of each look, by name."""
+        return {"captured": self.texture} | ({"albedo": self.albedo.texture} if self.albedo else {})
+
+    @property
     def rest(self) -> RestSurface:
         """Return the surface that rigs move."""
         return RestSurface(self.rest_points_m, self.shapes_m)

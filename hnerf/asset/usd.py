@@ -1,4 +1,4 @@
-"""Prims of USD files: geometry, look, rigs, motions and cameras, each at its place below /Avatar.
+"""Prims of USD files: geometry, look, rigs, motions, cameras and splats, each at its place below /Avatar.
 
 Y up, metres. Matrices are transposed when they are written (USD uses row vectors).
 """
@@ -6,22 +6,25 @@ Y up, metres. Matrices are transposed when they are written (USD uses row vector
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, UsdVol, Vt
 
 from hnerf.asset.levels import Level
 from hnerf.asset.quads import polygon_corners
 from hnerf.asset.rigs import FULL, StagedRig
 from hnerf.asset.skeleton import Skeleton
+from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.srgb import to_linear
-from hnerf.asset.staging import REST_POSE, StagedAvatar, box, moved_points, opengl_pose, shape_names
+from hnerf.asset.staging import CAPTURED, REST_POSE, StagedAvatar, box, moved_points, opengl_pose, shape_names
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
 from hnerf.geometry.camera import Camera
 
 ROOT = Sdf.Path("/Avatar")
 BODY = ROOT.AppendChild("Body")
 SKELETON, MOTION = (BODY.AppendChild(name) for name in ("Skeleton", "Motion"))
+SIGMAS = 3  # from a splat's centre to the end of its box
 APERTURE = 0.36  # film gate width in tenths of a scene unit, read as 36 mm where a unit is a metre
-TEXTURE_NAME, ALBEDO_NAME, LIGHT_NAME, NORMAL_MAP_NAME = "texture.png", "albedo.png", "light.png", "normal_map.png"
+TEXTURE_NAMES = {"captured": "texture.png", "albedo": "albedo.png"}  # by look
+LIGHT_NAME, NORMAL_MAP_NAME = "light.png", "normal_map.png"
 REST_NOTE = (
     f"Rest pose: {REST_POSE}, arms slanting down, elbows and knees a little bent; soles at height 0, facing +Z. The "
     "root joint stands on the ground below the pelvis; it moves over the ground and turns about the vertical with it."
@@ -32,11 +35,6 @@ def surface_path(level: int) -> Sdf.Path:
     """Return the path of the mesh at a level of detail. Each level has its own prim, since rigs have weights for
     each."""
     return BODY.AppendChild(f"Surface_lod{level}" if level else "Surface")
-
-
-def surface_paths(avatar: StagedAvatar) -> list[Sdf.Path]:
-    """Return the paths of the mesh at all levels of detail."""
-    return [surface_path(level) for level in range(len(avatar.levels))]
 
 
 def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
@@ -82,32 +80,19 @@ def physique_box(avatar: StagedAvatar, name: str) -> np.ndarray:
     return np.stack([boxes[:, 0].min(0) - grown_m, boxes[:, 1].max(0) + grown_m])
 
 
-def author_captured_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, prefix: str = "") -> None:
-    """Bind meshes to the texture in the recording's light. prefix: of the names of its images."""
-    _define_material(stage, "Captured", TEXTURE_NAME, meshes, avatar, prefix)
-
-
-def author_albedo_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, prefix: str = "") -> None:
-    """Bind meshes to the albedo, and define the recording's light. prefix: of the names of its images."""
-    assert avatar.albedo is not None  # or there is no such look
-    _define_material(stage, "Albedo", ALBEDO_NAME, meshes, avatar, prefix)
-    light = UsdLux.DomeLight.Define(stage, ROOT.AppendChild("Light"))
-    light.CreateIntensityAttr(avatar.albedo.dome[1])
-    light.CreateTextureFileAttr(f"./{prefix}{LIGHT_NAME}")
-    light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
-
-
-def _define_material(
-    stage: Usd.Stage, name: str, file: str, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, prefix: str
+def author_look(
+    stage: Usd.Stage, name: str, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, prefix: str = ""
 ) -> None:
-    """Define a matte preview surface with a texture file and the normal map, and bind meshes to it."""
-    material = UsdShade.Material.Define(stage, ROOT.AppendPath(f"Materials/{name}"))
+    """Define the material of one of the avatar's looks, a matte preview surface with its texture and the normal map,
+    and bind meshes to it; for the albedo, also define the recording's light. prefix: of the names of images."""
+    material = UsdShade.Material.Define(stage, ROOT.AppendPath(f"Materials/{name.capitalize()}"))
     UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
     reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("TextureCoordinates"))
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
     coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    texture = _define_texture(stage, material.GetPath().AppendChild("Texture"), prefix + file, "sRGB", coordinates)
+    path = material.GetPath().AppendChild("Texture")
+    texture = _define_texture(stage, path, prefix + TEXTURE_NAMES[name], "sRGB", coordinates)
     surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
@@ -125,6 +110,11 @@ def _define_material(
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     for mesh in meshes:
         UsdShade.MaterialBindingAPI.Apply(stage.OverridePrim(mesh)).Bind(material)
+    if name == "albedo" and avatar.albedo:
+        light = UsdLux.DomeLight.Define(stage, ROOT.AppendChild("Light"))
+        light.CreateIntensityAttr(avatar.albedo.dome[1])
+        light.CreateTextureFileAttr(f"./{prefix}{LIGHT_NAME}")
+        light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
 
 
 def _define_texture(
@@ -190,6 +180,30 @@ def author_cameras(stage: Usd.Stage, cameras: Iterable[Camera], stage_from_world
     folder = UsdGeom.Scope.Define(stage, ROOT.AppendChild("Cameras")).GetPath()
     for camera in cameras:
         define_camera(stage, folder.AppendChild(_free_name(stage, folder, camera.name)), camera, stage_from_world)
+
+
+def author_splats(stage: Usd.Stage, avatar: StagedAvatar, splats: Splats) -> None:
+    """Define the splats. Since the schema cannot skin them, they have centres and orientations (half precision) at each
+    frame of the captured motion, as the full rig moves the surface with its blend shapes."""
+    prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, ROOT.AppendChild("Splats"))
+    count = len(splats.face)
+    prim.CreateScalesAttr(vec3f(np.tile(splats.scales_m, (count, 1))))
+    prim.CreateOpacitiesAttr(Vt.FloatArray(count, OPACITY))
+    prim.CreateRadianceSphericalHarmonicsDegreeAttr(0)
+    prim.CreateRadianceSphericalHarmonicsCoefficientsAttr(vec3f(splats.coefficients))
+    Usd.ColorSpaceAPI.Apply(prim.GetPrim()).CreateColorSpaceNameAttr(Gf.ColorSpaceNames.SRGBRec709)
+    positions, orientations, boxes = prim.CreatePositionsAttr(), prim.CreateOrientationshAttr(), prim.CreateExtentAttr()
+    everywhere = []
+    surfaces_m = avatar.rigs[FULL].surfaces_m(CAPTURED, avatar.rest)
+    for frame, surface_m in zip(avatar.frames.astype(float).tolist(), surfaces_m, strict=True):
+        middles_m, _, quaternions = splats.on(surface_m)
+        box_m = box(middles_m) + SIGMAS * splats.sigma_m * np.array([[-1], [1]])
+        positions.Set(vec3f(middles_m), frame)
+        # USD keeps the real part last.
+        orientations.Set(Vt.QuathArray.FromNumpy(quaternions[:, [1, 2, 3, 0]].astype(np.float16)), frame)
+        boxes.Set(vec3f(box_m), frame)
+        everywhere.append(box_m)
+    UsdGeom.ModelAPI(stage.GetDefaultPrim()).SetExtentsHint(extent(np.concatenate(everywhere)))
 
 
 def joint_paths(skeleton: Skeleton) -> list[str]:
