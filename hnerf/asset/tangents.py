@@ -53,9 +53,7 @@ def uv_tangents(points_m: np.ndarray, normals: np.ndarray, faces: np.ndarray, la
 
 def frames_at(texels: Texels, normals: np.ndarray, faces: np.ndarray, layout: UvLayout, tangents: np.ndarray) -> Frames:
     """Return the frames at texels. normals (V, 3); tangents: of the layout, as `uv_tangents` returns them."""
-    face, share = texels.face.numpy(), texels.barycentric.double().numpy()[..., None]
-    normal = (normals[faces[face]] * share).sum(1)
-    turning = (tangents[layout.face_uvs[face]] * share).sum(1)
+    normal, turning = texels.interpolate(normals, faces), texels.interpolate(tangents, layout.face_uvs)
     tangent, side = turning[:, :3], np.where(turning[:, 3:] < 0, -1.0, 1.0)
     return Frames(normal, tangent, side * np.cross(normal, tangent))
 
