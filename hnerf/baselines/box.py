@@ -1,7 +1,7 @@
 """Common base classes of the compared methods: rays are sampled in the person's box, and in its coordinates."""
 
 from abc import abstractmethod
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -30,11 +30,6 @@ class BoxField(Field):
 
     centre_m: Tensor
     scale_m: Tensor
-
-    @classmethod
-    def build(cls, body: BodyFit, settings: Any, static: bool) -> Self:
-        """Return an untrained field; those that model one moment never get more frames."""
-        return cls(body, settings)  # type: ignore[call-arg]  # how all derived classes are constructed
 
     def __init__(self, body: BodyFit, samples: int, learning_rate: float):
         super().__init__()
