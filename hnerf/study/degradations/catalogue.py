@@ -1,22 +1,17 @@
 """The degradations that a stability study applies to a good capture, by name."""
 
 import itertools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from typing import Any, Literal
 
 import numpy as np
 
 from hnerf.config import Section, TrainingSettings
 from hnerf.errors import InputError
-from hnerf.study.degradations import cameras as degraded_rig
-from hnerf.study.degradations import clothing as degraded_clothing
-from hnerf.study.degradations import fit as degraded_fit
-from hnerf.study.degradations import images as degraded_images
-from hnerf.study.degradations import masks as degraded_masks
-from hnerf.study.degradations import occluder
+from hnerf.study.degradations import cameras, clothing, fit, images, masks, occluder
 
 Target = Literal["capture", "clothing", "masks", "fit", "settings", "poses"]
 Rng = np.random.Generator
@@ -56,39 +51,31 @@ class DegradationKind:
     label: str
     change: Callable[..., Any] | None = None
     neutral: float = 0.0
-    limit: float = math.inf
+    limit: float = inf
     integer: bool = False
 
 
 KINDS = {
-    "cameras_left": DegradationKind(
-        "capture", "training cameras left", degraded_rig.keep_cameras, math.inf, 1, integer=True
-    ),
-    "frames_left": DegradationKind(
-        "capture", "training frames left", degraded_rig.keep_frames, math.inf, 1, integer=True
-    ),
-    "camera_turned": DegradationKind("capture", "one camera turned, °", degraded_rig.rotate_camera),
-    "camera_out_of_step": DegradationKind(
-        "capture", "one camera late, frames", degraded_rig.delay_camera, integer=True
-    ),
-    "image_noise": DegradationKind("capture", "image noise, levels of 255", degraded_images.add_noise),
-    "image_blur": DegradationKind("capture", "blur, % of image width", degraded_images.blur),
-    "exposure": DegradationKind("capture", "exposure of cameras, values times 2^±x", degraded_images.vary_exposure),
-    "small_images": DegradationKind("capture", "image size, share", degraded_images.resize, 1, 0),
-    "large_images": DegradationKind("capture", "image size, multiple", degraded_images.resize, 1),
+    "cameras_left": DegradationKind("capture", "training cameras left", cameras.keep_cameras, inf, 1, integer=True),
+    "frames_left": DegradationKind("capture", "training frames left", cameras.keep_frames, inf, 1, integer=True),
+    "camera_turned": DegradationKind("capture", "one camera turned, °", cameras.rotate_camera),
+    "camera_out_of_step": DegradationKind("capture", "one camera late, frames", cameras.delay_camera, integer=True),
+    "image_noise": DegradationKind("capture", "image noise, levels of 255", images.add_noise),
+    "image_blur": DegradationKind("capture", "blur, % of image width", images.blur),
+    "exposure": DegradationKind("capture", "exposure of cameras, values times 2^±x", images.vary_exposure),
+    "small_images": DegradationKind("capture", "image size, share", images.resize, 1, 0),
+    "large_images": DegradationKind("capture", "image size, multiple", images.resize, 1),
     "occluder": DegradationKind("capture", "pillar in front, width in m", occluder.add_pillar),
     "skirt": DegradationKind(
-        "clothing", "skirt, hem off the legs in m", partial(degraded_clothing.add_clothing, degraded_clothing.skirt)
+        "clothing", "skirt, hem off the legs in m", partial(clothing.add_clothing, clothing.skirt)
     ),
-    "long_hair": DegradationKind(
-        "clothing", "long hair, m", partial(degraded_clothing.add_clothing, degraded_clothing.long_hair)
-    ),
-    "mask_eroded": DegradationKind("masks", "masks eroded, % of image width", degraded_masks.erode),
-    "mask_dilated": DegradationKind("masks", "masks dilated, % of image width", degraded_masks.dilate),
-    "mask_holes": DegradationKind("masks", "holes, % of each mask", degraded_masks.cut_holes, limit=100),
-    "mask_limb": DegradationKind("masks", "limb missing, % of masks", degraded_masks.cut_limb, limit=100),
-    "pose_noise": DegradationKind("fit", "pose noise, ° a joint", degraded_fit.add_pose_noise),
-    "wrong_shape": DegradationKind("fit", "wrong shape, mm on average", degraded_fit.change_shape),
+    "long_hair": DegradationKind("clothing", "long hair, m", partial(clothing.add_clothing, clothing.long_hair)),
+    "mask_eroded": DegradationKind("masks", "masks eroded, % of image width", masks.erode),
+    "mask_dilated": DegradationKind("masks", "masks dilated, % of image width", masks.dilate),
+    "mask_holes": DegradationKind("masks", "holes, % of each mask", masks.cut_holes, limit=100),
+    "mask_limb": DegradationKind("masks", "limb missing, % of masks", masks.cut_limb, limit=100),
+    "pose_noise": DegradationKind("fit", "pose noise, ° a joint", fit.add_pose_noise),
+    "wrong_shape": DegradationKind("fit", "wrong shape, mm on average", fit.change_shape),
     "learning_rate_up": DegradationKind("settings", "learning rate higher, times", neutral=1),
     "learning_rate_down": DegradationKind("settings", "learning rate lower, times", neutral=1, limit=0),
     "extreme_poses": DegradationKind("poses", "new pose, ° a joint"),
@@ -112,7 +99,7 @@ def check_strengths(name: str, strengths: tuple[float, ...]) -> None:
     kind = KINDS[name]
     (low, high), way = sorted((kind.neutral, kind.limit)), 1 if kind.neutral < kind.limit else -1
     onwards = all(way * a < way * b for a, b in itertools.pairwise((kind.neutral, *strengths)))
-    valid = all(0 < s < math.inf and low <= s <= high and not (kind.integer and s % 1) for s in strengths)
+    valid = all(0 < s < inf and low <= s <= high and not (kind.integer and s % 1) for s in strengths)
     if not (strengths and onwards and valid):
         what = f"{'whole ' * kind.integer}numbers between {low:g} and {high:g} that {'rise' if way > 0 else 'fall'}"
         raise InputError(f"degradation {name}: give {what}, the mildest first")
