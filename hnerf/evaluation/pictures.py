@@ -45,15 +45,12 @@ def frame_person(person: np.ndarray) -> tuple[slice, slice]:
     rows, columns = range(image_height)[box[0]], range(image_width)[box[1]]
     width, height = PICTURE_PX
     wanted_rows, wanted_columns = len(columns) * height // width, len(rows) * width // height
-    return (
-        _widened(rows, max(len(rows), wanted_rows), image_height),
-        _widened(columns, max(len(columns), wanted_columns), image_width),
-    )
+    return _widened(rows, wanted_rows, image_height), _widened(columns, wanted_columns, image_width)
 
 
 def _widened(part: range, length: int, limit: int) -> slice:
-    """Widen a part of [0, limit) to `length` about its middle, shifted to stay inside."""
-    length = min(length, limit)
+    """Widen a part of [0, limit) that is shorter than `length` about its middle, shifted to stay inside."""
+    length = min(max(length, len(part)), limit)
     start = min(max(0, part.start - (length - len(part)) // 2), limit - length)
     return slice(start, start + length)
 

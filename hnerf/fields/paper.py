@@ -154,11 +154,10 @@ class PaperField(Field):
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """Return c (N, 3) at points around the first body, seen along directions (N, 3)."""
-        row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
+        every = torch.arange(len(points_m), device=points_m.device)
+        row = torch.zeros_like(every)
         described = bodies.describe(points_m, row, FAR_M)
-        return self._radiance(
-            points_m, described, torch.arange(len(row), device=row.device), row, directions, conditions
-        )[1]
+        return self._radiance(points_m, described, every, row, directions, conditions)[1]
 
 
 def sample_pdf(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:

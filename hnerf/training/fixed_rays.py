@@ -11,7 +11,7 @@ from hnerf.fields.base import Field
 from hnerf.fields.conditions import Draws, concatenate, shard
 from hnerf.fields.rays import PosedScene
 from hnerf.fields.samples import RaySamples
-from hnerf.training.losses import pixel_colour
+from hnerf.training.losses import box_colour
 from hnerf.training.pixels import PixelRays, Pixels
 from hnerf.training.step import TrainingError
 
@@ -35,7 +35,7 @@ class FixedRays:
         """Return the PSNR on the person's pixels of the frames in rows; None if none is drawn."""
         rays, samples = self.sample(scene, rows, self.field.samples)
         mixed = rays.edge & (not self.field.models_background)  # mixed with a background that only such a field models
-        error = (pixel_colour(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
+        error = (box_colour(samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean())) if len(error) else None
 
     @torch.no_grad()
