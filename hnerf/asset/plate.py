@@ -29,7 +29,7 @@ LEAST_AREA_M2 = 1e-12
 
 
 @dataclass(frozen=True)
-class Plate:
+class ThinPlate:
     """The energies of a mesh: area_m2 (V,), and bending and gaps as quadratic forms (V, V)."""
 
     area_m2: np.ndarray
@@ -37,12 +37,12 @@ class Plate:
     gaps: csc_array
 
     @staticmethod
-    def of(vertices_m: np.ndarray, faces: np.ndarray) -> "Plate":
+    def of(vertices_m: np.ndarray, faces: np.ndarray) -> "ThinPlate":
         """Return the plate that is at rest as a mesh (V, 3), (F, 3)."""
         area_m2, laplacian = cotangent_laplacian(vertices_m, faces)
         pairs, width_m = facing_pairs(vertices_m, faces)
         stiffness = (GAP_WEIGHT_M / width_m.clip(NARROWEST_M)) ** 2 * (np.abs(pairs) @ area_m2) / 2
-        return Plate(
+        return ThinPlate(
             area_m2,
             csc_array(laplacian.T @ diags_array(1 / area_m2) @ laplacian),
             csc_array(pairs.T @ diags_array(stiffness) @ pairs),

@@ -11,7 +11,7 @@ import numpy as np
 import pymeshlab
 import trimesh
 
-from hnerf.asset.plate import START_M, Plate
+from hnerf.asset.plate import START_M, ThinPlate
 from hnerf.body.base_mesh import BaseMesh
 from hnerf.body.descriptor import normals_of
 from hnerf.geometry.mesh_queries import Surface
@@ -31,7 +31,7 @@ class Registration:
 
     vertices_m: np.ndarray
     trust: np.ndarray
-    plate: Plate
+    plate: ThinPlate
 
 
 def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
@@ -42,7 +42,7 @@ def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
     This leaves fingers as they are where the field has a mitten.
     """
     body_m, faces = body.rig.vertices_m.double().numpy(), body.rig.faces.numpy()
-    plate, surface = Plate.of(body_m, faces), Surface(target)
+    plate, surface = ThinPlate.of(body_m, faces), Surface(target)
     scale_m = np.minimum(_thickness_m(body_m, faces) / 2, FARTHEST_M)
     moved_m, trust = body_m, np.zeros(len(body_m))
     for smoothing_m in SMOOTHING_M:
@@ -79,7 +79,7 @@ def _thickness_m(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(hits.face >= 0, hits.distance_m, 0) + START_M
 
 
-def _loosened(vertices_m: np.ndarray, faces: np.ndarray, skin_faces: int, plate: Plate) -> np.ndarray:
+def _loosened(vertices_m: np.ndarray, faces: np.ndarray, skin_faces: int, plate: ThinPlate) -> np.ndarray:
     """Return the mesh with those faces of its skin that cross each other drawn into the body."""
     keep = plate.solver(np.ones(len(vertices_m)), LOOSEN_SMOOTHING_M)
     for _ in range(LOOSEN_STEPS):

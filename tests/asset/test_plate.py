@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from hnerf.asset.plate import GAP_WEIGHT_M, LEAST_COTANGENT, SKIN_WEIGHT, Plate, cotangent_laplacian, facing_pairs
+from hnerf.asset.plate import GAP_WEIGHT_M, LEAST_COTANGENT, SKIN_WEIGHT, ThinPlate, cotangent_laplacian, facing_pairs
 from tests.asset.figure import twice
 
 ONE_SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
@@ -35,7 +35,7 @@ def test_waves_shorter_than_the_smoothing_length_are_damped() -> None:
     """With a smoothing length l, a wave of length L keeps 1 / (1 + e + (2 pi l / L)^4) of its height; e is
     SKIN_WEIGHT."""
     vertices_m, faces = strip(120, 6, 0.005)
-    plate = Plate.of(vertices_m, faces)
+    plate = ThinPlate.of(vertices_m, faces)
     for length_m, smoothing_m in ((0.1, 0.01), (0.1, 0.02), (0.2, 0.02)):
         wave = np.sin(2 * np.pi * vertices_m[:, :1] / length_m)
         smooth = plate.solver(np.ones(len(wave)), smoothing_m)(wave)
@@ -47,7 +47,7 @@ def test_waves_shorter_than_the_smoothing_length_are_damped() -> None:
 def test_untrusted_regions_are_filled_in_smoothly() -> None:
     vertices_m, faces = strip(60, 4, 0.01)
     trust = (np.abs(vertices_m[:, 0] - 0.3) > 0.05).astype(float)
-    moved_m = Plate.of(vertices_m, faces).solver(trust, 0.01)(np.where(trust, 0.02, 5.0)[:, None])
+    moved_m = ThinPlate.of(vertices_m, faces).solver(trust, 0.01)(np.where(trust, 0.02, 5.0)[:, None])
     np.testing.assert_allclose(moved_m, 0.02, rtol=1e-3)
 
 
@@ -71,7 +71,7 @@ def test_the_two_sides_of_a_narrow_gap_move_together() -> None:
     """Box 1 is pulled by d, box 2 is held in place. The gap is much narrower than GAP_WEIGHT_M, so they share the
     displacement."""
     boxes = two_boxes(GAP_WEIGHT_M / 10)
-    plate = Plate.of(boxes.vertices, boxes.faces)
+    plate = ThinPlate.of(boxes.vertices, boxes.faces)
     first = boxes.vertices[:, 0] < 0.0101
     wanted = np.where(first, 0.01, 0.0)[:, None]
     moved = plate.solver(np.ones(len(wanted)), 0.1)(wanted)  # so each box is stiff

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from hnerf.asset.plate import Plate
+from hnerf.asset.plate import ThinPlate
 from hnerf.asset.registration import _loosened, _match, crossing_faces, register
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.body.base_mesh import BaseMesh, base_mesh
@@ -71,7 +71,7 @@ def test_intersecting_faces_are_pulled_apart() -> None:
     boxes = twice(box, (0.0195, 0.001, 0.001))  # they overlap by half a millimetre
     vertices_m, faces = np.asarray(boxes.vertices), np.asarray(boxes.faces)
     assert crossing_faces(vertices_m, faces).any()
-    apart_m = _loosened(vertices_m, faces, len(faces), Plate.of(vertices_m, faces))
+    apart_m = _loosened(vertices_m, faces, len(faces), ThinPlate.of(vertices_m, faces))
     assert not crossing_faces(apart_m, faces).any()
     assert np.abs(apart_m - vertices_m).max() < 0.003
 
