@@ -26,9 +26,10 @@ def check_subject(capture: Capture, subject: PersonTrack) -> None:
     heights = [person_heights_px(k[s.any(-1)]) for k, s in zip(subject.keypoints, seen, strict=True) if s.any()]
     tallest_px = max(float(np.median(px)) for px in heights)
     if tallest_px < MIN_HEIGHT_PX:
+        shrunk = any(size_px != capture.cameras[name].size_px for name, size_px in capture.recorded_sizes_px.items())
         raise InputError(
             f"{capture.name}: the person is {tallest_px:.0f} px tall at most, and {MIN_HEIGHT_PX} are needed; record "
-            "from nearer by, or raise capture.max_side_px if the recording is larger"
+            f"from nearer by{', or raise capture.max_side_px in `hnerf run`' if shrunk else ''}"
         )
     by_any_camera = seen[..., WHOLE].any(0)  # (frames, 12)
     if not by_any_camera.all(-1).any():

@@ -78,9 +78,15 @@ def test_the_overview_draws_the_subject_green_and_others_red(capture: Capture, t
 
 
 def test_a_person_who_is_too_small_is_refused(capture: Capture) -> None:
+    """Larger images help only if the recording has them."""
     check_subject(capture, track(standing(25, 80), standing(25, 80)))
-    with pytest.raises(InputError, match="ring: the person is 79 px tall at most, and 80 are needed; record"):
-        check_subject(capture, track(standing(25, 79), standing(25, 79)))
+    small, larger = track(standing(25, 79), standing(25, 79)), ", or raise capture.max_side_px in `hnerf run`"
+    for recorded_px, also in ((SIZE_PX, ""), (2 * SIZE_PX, larger)):
+        as_recorded = dataclasses.replace(capture, recorded_sizes_px={"c0": (recorded_px, recorded_px)})
+        with pytest.raises(InputError) as refused:
+            check_subject(as_recorded, small)
+        needed = "ring: the person is 79 px tall at most, and 80 are needed; record from nearer by"
+        assert str(refused.value) == needed + also
 
 
 def test_a_person_who_is_always_cut_off_is_refused(capture: Capture) -> None:
