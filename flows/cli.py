@@ -248,16 +248,16 @@ def _add_out(command: argparse.ArgumentParser, default: str) -> None:
     command.add_argument("--out", type=path, default=default, help=f"new folder to write (default: {default})")
 
 
-def _add_study(command: argparse.ArgumentParser, default: str, folder: str) -> None:
+def _add_study(command: argparse.ArgumentParser, default: str, folder: str, needs: str) -> None:
     study = command.add_mutually_exclusive_group()
-    what = f"study of configs/{folder}/, or a YAML file (default: {default})"
+    what = f"study of configs/{folder}/, or a YAML file (default: {default}, which needs {needs})"
     study.add_argument("--study", default=default, help=what)
     what = "the study `quick`, about 15 minutes"
     study.add_argument("--quick", dest="study", action="store_const", const="quick", help=what)
 
 
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
-    _add_study(benchmark, "dynamic", "benchmark")
+    _add_study(benchmark, "dynamic", "benchmark", "a GPU")
     what = "presets or YAML files to compare, like fast,nerf (default: the study's)"
     benchmark.add_argument("--methods", type=_names, metavar="LIST", help=what)
     what = "time limit of each training (default: the study's)"
@@ -271,7 +271,7 @@ def _add_ablate(ablations: argparse.ArgumentParser) -> None:
 
 
 def _add_stability(stability: argparse.ArgumentParser) -> None:
-    _add_study(stability, "full", "stability")
+    _add_study(stability, "full", "stability", "a GPU and days")
     what = "presets, like fast,nerf (default: the study's)"
     stability.add_argument("--methods", type=_names, default=[], metavar="LIST", help=what)
     stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
