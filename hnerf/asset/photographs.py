@@ -52,17 +52,21 @@ class TexelPixels:
     pixel: np.ndarray
     colours: np.ndarray
 
-    def unexplained(self, shown: np.ndarray) -> np.ndarray:
+    def unexplained(self, shown: np.ndarray, counts: np.ndarray) -> np.ndarray:
         """Return the difference (M, 3) between the pixel of each texel and the mean colour of the texels in that pixel.
-        shown (M, 3): the colours of the texels."""
-        count = np.bincount(self.pixel)[:, None]
-        total = np.stack([np.bincount(self.pixel, channel) for channel in shown.T], 1)
+        shown (M, 3): the colours of the texels; counts (M, 1): their weights in the mean."""
+        count = np.bincount(self.pixel, counts[:, 0])[:, None].clip(1e-20)
+        total = np.stack([np.bincount(self.pixel, channel) for channel in (counts * shown).T], 1)
         return (self.colours - total / count).astype(np.float32).take(self.pixel, 0)
 
 
 class BackProjection:
     """Iterative back-projection (Irani and Peleg 1991). It sharpens a weighted mean over photographs, whose pixels
-    average their texels, so that the texels, averaged over pixels again, look like the photographs."""
+    average their texels, so that the texels, averaged over pixels again, look like the photographs.
+
+    Both means have the same weights. If texels that hardly count, such as those of an eyeball close behind its lid, had
+    a full share of their pixels, the others there would be changed to make up for them.
+    """
 
     def __init__(self) -> None:
         self._views: list[tuple[TexelPixels, np.ndarray, np.ndarray | float]] = []
@@ -78,7 +82,8 @@ class BackProjection:
         for _ in range(BACK_PROJECTIONS):
             change = np.zeros_like(colours)
             for pixels, counts, light in self._views:
-                change[pixels.index] += counts * pixels.unexplained(colours.take(pixels.index, 0) * light)
+                shown = colours.take(pixels.index, 0) * light
+                change[pixels.index] += counts * pixels.unexplained(shown, counts)
             colours = np.clip(colours + change / weight, 0, 1).astype(np.float32)
         return colours
 

@@ -180,11 +180,24 @@ def test_a_photograph_that_contradicts_the_field_has_little_weight(monkeypatch: 
 
 
 def test_unexplained_colour_is_pixel_minus_mean_of_its_texels() -> None:
-    """Three texels lie in a pixel of 0.5 and have a mean of 0.4; a fourth, of 0.3, lies in a pixel of 0.2."""
+    """Three texels lie in a pixel of 0.5 and have a mean of 0.4; a fourth, of 0.3, lies in a pixel of 0.2. With weights
+    of 1, 3 and 4, the three have a mean of (0.2 + 3 x 0.6 + 4 x 0.4) / 8 = 0.45."""
     levels = np.array([[0.2], [0.3], [0.6], [0.4]]) * [1, 1, 1]
     pixel, photograph = np.array([0, 1, 0, 0]), np.array([[0.5] * 3, [0.2] * 3])
     pixels = TexelPixels(np.array([1, 2, 3, 4]), pixel, photograph)
-    np.testing.assert_allclose(pixels.unexplained(levels)[:, 0], [0.1, -0.1, 0.1, 0.1])
+    np.testing.assert_allclose(pixels.unexplained(levels, np.ones((4, 1)))[:, 0], [0.1, -0.1, 0.1, 0.1])
+    weights = np.array([[1.0], [2], [3], [4]])
+    np.testing.assert_allclose(pixels.unexplained(levels, weights)[:, 0], [0.05, -0.1, 0.05, 0.05])
+
+
+def test_sharpening_leaves_a_texel_alone_if_others_in_its_pixels_hardly_count() -> None:
+    """One texel is as the photograph shows it, 0.6; two black ones in the same pixel have a thousandth of its
+    weight."""
+    projection = BackProjection()
+    counts = np.array([[1.0], [1e-3], [1e-3]])
+    projection.add(TexelPixels(np.arange(3), np.zeros(3, int), np.full((1, 3), 0.6)), counts)
+    sharpened = projection.sharpened(np.array([[0.6], [0], [0]]) * [1, 1, 1], np.array([[1.0], [1], [1]]))
+    np.testing.assert_allclose(sharpened[0], 0.6, atol=0.005)
 
 
 def test_sharpening_recovers_stripes_averaged_by_pixels() -> None:
