@@ -73,7 +73,7 @@ class GlbWriter:
 
 def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     """Write a rig of the avatar with all its motions except the resampled ones. Joints are nodes 0 to J-1, the mesh is
-    node J; time 0 is a motion's first instant."""
+    node J; time 0 is a motion's first instant. Mesh and skin are named as in USD; Blender shows these names."""
     writer = GlbWriter()
     document = writer.document
     _add_joints(document, rig.skeleton)
@@ -81,11 +81,14 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     primitive = _primitive(writer, avatar, rig.skin)
     _add_materials(writer, avatar, primitive)
     document.meshes.append(
-        gltf.Mesh(primitives=[primitive], weights=[0.0] * len(names) or None, extras={"targetNames": names})
+        gltf.Mesh(
+            name="Surface", primitives=[primitive], weights=[0.0] * len(names) or None, extras={"targetNames": names}
+        )
     )
     inverse_bind = np.linalg.inv(rig.skeleton.bind).swapaxes(1, 2).astype(np.float32)  # stored by columns
     joints = list(range(len(rig.skeleton.names)))
-    document.skins.append(gltf.Skin(inverseBindMatrices=writer.accessor(inverse_bind), joints=joints, skeleton=0))
+    bind = writer.accessor(inverse_bind)
+    document.skins.append(gltf.Skin(name="Skeleton", inverseBindMatrices=bind, joints=joints, skeleton=0))
     document.nodes.append(gltf.Node(name="Surface", mesh=0, skin=0))
     document.scenes[0].nodes = [0, len(joints)]
     motions = {name: motion for name, motion in rig.motions.items() if name not in RESAMPLED}

@@ -16,6 +16,7 @@ from hnerf.asset.glb import SPECULAR, VARIANTS, write_glb
 from hnerf.asset.staging import StagedAvatar, moved_points
 from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
+from hnerf.asset.usd import SKELETON, surface_path
 from hnerf.body.descriptor import normals_of
 from tests.asset.figure import FRAMES
 
@@ -121,6 +122,11 @@ def test_another_reader_finds_mesh_texture_and_joints(glb: Path, rig: str, stage
     inverse_bind = accessor(document, document.skins[0].inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
     for name, matrix in zip(staged.rigs[rig].skeleton.names, inverse_bind, strict=True):
         assert np.abs(matrix @ scene.graph.get(name)[0] - np.eye(4)).max() < 1e-6
+
+
+def test_mesh_and_skin_have_the_names_of_their_prims_in_usd(glb: Path) -> None:
+    document = pygltflib.GLTF2.load(str(glb))
+    assert (document.meshes[0].name, document.skins[0].name) == (surface_path(0).name, SKELETON.name)
 
 
 def test_a_normal_map_comes_with_tangents(glb: Path, staged: StagedAvatar) -> None:
