@@ -5,7 +5,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import NamedTuple, TypeVar
 
 T = TypeVar("T")
@@ -80,9 +80,10 @@ def relay() -> None:
 def report_relayed(line: str) -> bool:
     """Report the progress in a line that another process wrote after calling `relay`; return whether it is such a line.
     The rest of the line is dropped: processes and their libraries share one pipe, and do not wait for each other's line
-    ends."""
+    ends. So is progress that was cut short, as on a full disk."""
     if line.startswith(RECORD_SEPARATOR):
-        progress, _ = json.JSONDecoder().raw_decode(line.removeprefix(RECORD_SEPARATOR))
-        report(*progress)
+        with suppress(ValueError):
+            progress, _ = json.JSONDecoder().raw_decode(line.removeprefix(RECORD_SEPARATOR))
+            report(*progress)
         return True
     return False

@@ -43,6 +43,13 @@ def test_text_of_another_process_on_the_line_is_dropped(reported: pytest.LogCapt
     assert [record.progress for record in reported.records] == [("training", 1, 4)]
 
 
+@pytest.mark.parametrize("rest", ["", "OSError: no room", '["training", 2, 4]'])
+def test_progress_that_is_cut_short_is_dropped(rest: str, reported: pytest.LogCaptureFixture) -> None:
+    """A full disk takes part of a line; the error of the process itself says so."""
+    assert progress.report_relayed(f'{progress.RECORD_SEPARATOR}["training", 1{rest}')
+    assert reported.records == []
+
+
 def test_the_seconds_of_a_step_are_logged_and_stored(
     reported: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
