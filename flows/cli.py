@@ -3,6 +3,7 @@
 import argparse
 import errno
 import logging
+import os
 import select
 import sys
 from collections.abc import Callable
@@ -55,6 +56,7 @@ def main(argv: list[str] | None = None) -> int:
 def _run(argv: list[str] | None) -> int:
     """Run one command; return the exit code."""
     try:
+        _require_current_folder()
         options = _options(argv)
         with unwound_by_signals(), display():
             folders = _existing(options)
@@ -91,6 +93,14 @@ def _run(argv: list[str] | None) -> int:
             raise
         return _fail(f"{error.filename}: {error.strerror}; give another path, or mend this one", BAD_INPUT)
     return 0
+
+
+def _require_current_folder() -> None:
+    """Raise InputError if the current folder was removed, as by a script that made it anew: libraries crash there."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise InputError("the current folder was removed; change to another one") from None
 
 
 def _options(argv: list[str] | None) -> argparse.Namespace:

@@ -141,6 +141,17 @@ def test_an_empty_path_is_not_taken_for_the_current_folder(capsys: pytest.Captur
     assert main(["run", ""]) == 2
 
 
+def test_a_current_folder_that_was_removed_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Torch's library ends the process there, even if all paths are absolute."""
+    (tmp_path / "ada").mkdir()
+    monkeypatch.chdir(tmp_path / "ada")
+    (tmp_path / "ada").rmdir()
+    assert main(["store", "list"]) == 2
+    assert capsys.readouterr().err == "hnerf: the current folder was removed; change to another one\n"
+
+
 def test_a_path_that_is_not_utf8_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
