@@ -4,7 +4,6 @@ import hashlib
 import logging
 import os
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -19,6 +18,7 @@ from pydantic import Field
 from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.config import load_settings
 from hnerf.errors import InputError
+from hnerf.files import now_s
 from tasks import quarantine
 from tasks.bucket import is_visible
 from tasks.ledger import Ledger
@@ -113,7 +113,7 @@ def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tup
     for capture in _captures(folder.absolute()):  # elsewhere, a link may lead to another place
         try:
             listing, touched_s = _listing(capture)
-            if touched_s and time.time() - touched_s >= settle_s and not ledger.seen(listing):
+            if touched_s and not ledger.seen(listing) and now_s(folder) - touched_s >= settle_s:
                 yield capture, listing
         except FileNotFoundError as error:  # removed meanwhile
             log.error("%s", error)

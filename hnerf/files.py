@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -62,6 +63,16 @@ def replace_text(path: Path, text: str) -> None:
     encoded = text.encode()
     with atomic_file(path) as beside, beside.open("xb") as file:  # never through a link that lies there
         file.write(encoded)
+
+
+def now_s(folder: Path) -> float:
+    """Return the time, in seconds since 1970, by the clock that dates files in a folder. On a share, that is another
+    machine's clock; if the folder cannot be written, it is this machine's."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            return os.fstat(file.fileno()).st_mtime
+    except OSError:
+        return time.time()
 
 
 def copy_folder(source: Path, target: Path) -> None:

@@ -7,13 +7,12 @@
 <store>/ingested/id               random, so that the same key in another ledger is another run
 """
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
 
-from hnerf.files import replace_text
+from hnerf.files import now_s, replace_text
 
 LOST = ".lost"
 
@@ -41,12 +40,11 @@ class Ledger:
         return path.exists() and self.knows(path.read_text(errors="replace").strip() or "none")
 
     def stood_s(self, listing: str) -> float:
-        """Return for how long a listing has been the same, in seconds by this machine's clock: 0 on the first call for
-        it."""
+        """Return for how long a listing has been the same, in seconds: 0 on the first call for it."""
         path = self.root / f"new-{listing}"
         if not path.exists():
             replace_text(path, "")
-        return time.time() - path.stat().st_mtime
+        return now_s(self.root) - path.stat().st_mtime
 
     def note_seen(self, listing: str, digest: str) -> None:
         """Note the content of a folder with this listing."""

@@ -1,12 +1,13 @@
 import errno
 import os
+import time
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
 from hnerf.errors import InputError
-from hnerf.files import atomic_file, atomic_folder, copy_folder, made_folder, replace_text
+from hnerf.files import atomic_file, atomic_folder, copy_folder, made_folder, now_s, replace_text
 from tests.full_disk import files_up_to
 
 
@@ -87,3 +88,10 @@ def test_an_error_names_the_file_and_not_its_temporary_copy(tmp_path: Path, miss
         if missing == "folder":
             beside.touch()
     assert str(caught.value) == f"[Errno 2] No such file or directory: '{path}'"
+
+
+def test_the_time_is_that_of_new_files_or_else_this_machines(tmp_path: Path) -> None:
+    before_s = now_s(tmp_path)
+    (tmp_path / "a").touch()
+    assert before_s <= (tmp_path / "a").stat().st_mtime <= now_s(tmp_path) and len(list(tmp_path.iterdir())) == 1
+    assert abs(now_s(tmp_path / "missing") - time.time()) < 5

@@ -103,6 +103,16 @@ def test_folders_being_written_and_hidden_or_empty_folders_are_not_started(watch
     assert look(watched) == ["ada", "bob"]
 
 
+@pytest.mark.parametrize("ahead_s", [-300, 300])
+def test_captures_on_a_share_whose_clock_differs_wait_no_longer_or_shorter(
+    ahead_s: float, watched: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + ahead_s)
+    assert look(watched, settle_s=60.0) == []
+    assert look(watched) == ["ada", "bob"]
+
+
 def test_a_capture_with_a_hidden_partial_file_waits(watched: Path) -> None:
     """rsync writes to a hidden temporary name."""
     for path in [*watched.rglob("*")]:

@@ -2,6 +2,9 @@ import os
 import time
 from pathlib import Path
 
+import pytest
+
+from hnerf.files import now_s
 from tasks.ledger import Ledger, forget, was_started
 
 DIGEST, OTHER = "a" * 64, "b" * 64
@@ -29,12 +32,22 @@ def test_a_store_without_a_ledger_has_nothing_to_forget(tmp_path: Path) -> None:
 
 def test_the_age_of_a_listing_counts_from_its_first_query(tmp_path: Path) -> None:
     """First seen 100 s ago. Asking again does not restart the count; starting the capture does."""
-    ledger, began_s = Ledger.of(tmp_path), time.time() - 100
+    ledger, began_s = Ledger.of(tmp_path), now_s(tmp_path) - 100
     assert ledger.stood_s("seen-ada") < 50
     os.utime(tmp_path / "ingested" / "new-seen-ada", (began_s, began_s))
     assert 100 <= ledger.stood_s("seen-ada") < 150 and 100 <= ledger.stood_s("seen-ada") < 150
     ledger.note_seen("seen-ada", DIGEST)
     assert ledger.stood_s("seen-ada") < 50
+
+
+@pytest.mark.parametrize("ahead_s", [-300, 300])
+def test_the_age_of_a_listing_does_not_depend_on_this_machines_clock(
+    ahead_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The ledger may be on a share, whose server dates the files."""
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + ahead_s)
+    assert 0 <= Ledger.of(tmp_path).stood_s("seen-ada") < 50
 
 
 def test_an_empty_note_is_ignored(tmp_path: Path) -> None:
