@@ -154,7 +154,10 @@ def place(store: Store, name: str, one: ArchivedArtifact, scratch: Path) -> Arti
     partial.mkdir()
     for inside, file in one.files.items():
         (partial / inside).parent.mkdir(parents=True, exist_ok=True)
-        os.link(scratch / file.sha256, partial / inside)
+        try:
+            os.link(scratch / file.sha256, partial / inside)
+        except OSError:  # the stage's folder is on another disk, or this one knows no second name of a file
+            shutil.copyfile(scratch / file.sha256, partial / inside)
     described = one.model_dump(include={"metrics", "inputs"})
     return store.commit(Artifact(stage=stage, root=store.path(stage, key), files={}, **described))
 

@@ -1,3 +1,4 @@
+import errno
 import io
 import json
 import os
@@ -7,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -71,6 +73,17 @@ def test_artifacts_that_exist_already_are_kept(packed: Path, tmp_path: Path) -> 
     import_subject(store, packed)
     assert (made.root / "deep" / "letters").stat().st_nlink == 1
     assert names([made]) <= Inventory.of(store).stored.keys()
+
+
+def test_a_stage_may_be_on_another_disk(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its folder is a link, and no file can have a name on both disks."""
+    (tmp_path / "big").mkdir()
+    (tmp_path / "to").mkdir()
+    (tmp_path / "to" / "training").symlink_to(tmp_path / "big")
+    monkeypatch.setattr(os, "link", Mock(side_effect=OSError(errno.EXDEV, os.strerror(errno.EXDEV))))
+    store = Store(tmp_path / "to")
+    import_subject(store, packed)
+    assert len(Inventory.of(store).stored) == 6 and faults(store).lines == []
 
 
 def test_hands_that_the_imported_results_did_not_use_are_not_linked(packed: Path, tmp_path: Path) -> None:
