@@ -59,10 +59,13 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Replace a text file atomically."""
+    """Replace a text file atomically, also if the power fails: on the disk, a file may otherwise have its name before
+    its text."""
     encoded = text.encode()
     with atomic_file(path) as beside, beside.open("xb") as file:  # never through a link that lies there
         file.write(encoded)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def now_s(folder: Path) -> float:

@@ -74,6 +74,15 @@ def test_two_processes_with_one_id_can_replace_a_text_at_once(tmp_path: Path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["note"] and (tmp_path / "note").read_text() == "mine"
 
 
+def test_a_text_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On ext4, a file that has its name alone is empty after a power cut."""
+    done: list[str] = []
+    monkeypatch.setattr(os, "fsync", lambda file: done.append(Path(f"/dev/fd/{file}").read_text()))
+    monkeypatch.setattr(os, "replace", lambda *_: done.append("named"))
+    replace_text(tmp_path / "note", "mine")
+    assert done == ["mine", "named"]
+
+
 def test_a_failed_replacement_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "replace", Mock(side_effect=OSError("full")))
     with pytest.raises(OSError, match="full"):
