@@ -12,6 +12,7 @@ from typing import Any
 
 from prefect import flow
 
+from flows.arguments import StoreFolder
 from flows.preparation import prepare_training, with_detections
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
@@ -40,7 +41,7 @@ COLUMNS = results.COLUMNS | {"psnr": ("PSNR", "{:.2f}")}
 def ablate(
     capture: Path,
     preset: str = "fast",
-    store: Path = Path("store"),
+    store: StoreFolder = Path("store"),
     overrides: Sequence[str] = (),
     only: Sequence[str] = (),
 ) -> Path:

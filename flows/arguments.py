@@ -1,12 +1,17 @@
-"""Types of command-line arguments."""
+"""Types of command-line arguments, and of parameters of flows."""
 
 import argparse
 import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 MAX_COUNT = 999_999  # image names have six digits
+# The server refuses an empty one, as from a variable that is not set, which would be the checkout.
+StoreFolder = Annotated[Path, Field(json_schema_extra={"minLength": 1})]
 
 
 def path(text: str) -> Path:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from prefect import flow
 from pydantic import Field
 
+from flows.arguments import StoreFolder
 from flows.preparation import Prepared, ingest_part, prepare_training
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
@@ -37,7 +38,7 @@ def benchmark(
     study: str = "dynamic",
     methods: list[str] | None = None,
     seconds: Annotated[float, Field(gt=0)] | None = None,
-    store: Path = Path("store"),
+    store: StoreFolder = Path("store"),
 ) -> Path:
     """Train and score every method of a study on every variant; return `<store>/benchmark/<subject>-<study>.md`. CSV,
     JSON and charts are next to it; all are rewritten after every training.

@@ -15,6 +15,7 @@ from prefect.deployments import run_deployment
 from prefect.events import emit_event
 from pydantic import Field
 
+from flows.arguments import StoreFolder
 from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.config import load_settings
 from hnerf.errors import InputError
@@ -34,7 +35,7 @@ log = logging.getLogger("hnerf.ingest_captures")
 def ingest_captures(
     folder: Path | str,
     preset: str = "fast",
-    store: Path = Path("store"),
+    store: StoreFolder = Path("store"),
     settle_s: Annotated[float, Field(ge=0, le=86400)] = 60.0,
     max_unfinished: Annotated[int, Field(ge=1, le=1000)] = 20,
     max_restarts: Annotated[int, Field(ge=0, le=20)] = 3,

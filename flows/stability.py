@@ -10,6 +10,7 @@ from typing import Any
 
 from prefect import flow
 
+from flows.arguments import StoreFolder
 from flows.preparation import Prepared, ingest_part, prepare_training
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
@@ -51,7 +52,7 @@ IMAGE_FIGURES = ("psnr", "ssim", "empty_psnr", "posed_psnr", "tracked_psnr")
 def stability(
     capture: Path,
     study: str = "full",
-    store: Path = Path("store"),
+    store: StoreFolder = Path("store"),
     methods: Sequence[str] = (),
     only: Sequence[str] = (),
 ) -> Path:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from prefect import flow
 from prefect.client.schemas.objects import FlowRun, State
 
+from flows.arguments import StoreFolder
 from flows.preparation import Prepared, segment_and_fit, segment_subject, with_detections
 from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
@@ -48,7 +49,7 @@ class Trained(NamedTuple):
 
 @flow(name="train-subject", flow_run_name="{capture}")
 def train_subject(
-    capture: Path | str, preset: str = "fast", store: Path = Path("store"), overrides: list[str] | None = None
+    capture: Path | str, preset: str = "fast", store: StoreFolder = Path("store"), overrides: list[str] | None = None
 ) -> Trained:
     """Train one person and export the avatar; return where the results are.
 

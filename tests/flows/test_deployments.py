@@ -5,6 +5,7 @@ import sys
 import time
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -79,15 +80,17 @@ def test_every_parameter_of_every_deployment_has_a_description(deployed: str) ->
     assert len(found) == 5
     for deployment in found.values():
         assert deployment.tags and deployment.parameter_openapi_schema
+        assert deployment.parameter_openapi_schema["properties"]["store"]["minLength"] == 1
         for name, parameter in deployment.parameter_openapi_schema["properties"].items():
             assert parameter.get("description"), f"{deployment.entrypoint}: {name}"
     watch = found["flows/ingest_captures.py:ingest_captures"].parameter_openapi_schema["properties"]  # type: ignore[index]
     assert (watch["max_unfinished"]["minimum"], watch["max_unfinished"]["maximum"]) == (1, 1000)
 
 
-def test_values_out_of_range_are_refused_before_a_run_is_created(deployed: str) -> None:
+@pytest.mark.parametrize("wrong", [{"max_unfinished": 0}, {"store": ""}])
+def test_values_out_of_range_are_refused_before_a_run_is_created(wrong: dict[str, Any], deployed: str) -> None:
     with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
-        run_deployment("ingest-captures/local", parameters={"folder": "captures", "max_unfinished": 0}, timeout=0)
+        run_deployment("ingest-captures/local", parameters={"folder": "captures", **wrong}, timeout=0)
 
 
 def test_a_crashed_run_is_restarted_a_few_times_and_then_fails(deployed: str) -> None:
