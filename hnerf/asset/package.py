@@ -80,7 +80,7 @@ def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: f
 
 def write_usdz(path: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar.usdz`: the same prims and variants as the package in a single layer, and the texture."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         layer = Path(folder) / "avatar.usdc"
         stage = _new_stage(layer, path.name, avatars, _time_range(avatars, CAPTURED, fps), fps, info)
         for part in _parts(avatars, list(cameras), fps):
@@ -92,7 +92,7 @@ def write_usdz(path: Path, avatars: Avatars, cameras: Iterable[Camera], fps: flo
 
 def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar_cache.usdz`: the surface as world-space points at every frame, for programs without skinning."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         layer = Path(folder) / "avatar_cache.usdc"
         stage = _new_stage(layer, path.name, {"": avatar}, avatar.frames, fps, info)
         usd.author_cameras(stage, cameras, avatar.stage_from_world)

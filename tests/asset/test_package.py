@@ -1,5 +1,6 @@
 import dataclasses
 import itertools
+import tempfile
 import time
 from pathlib import Path
 from zipfile import ZipFile
@@ -11,7 +12,7 @@ from pxr import Ar, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.correctives import correctives_of
 from hnerf.asset.dome import dome
-from hnerf.asset.package import _everywhere, write_usdz
+from hnerf.asset.package import _everywhere, write_cache, write_usdz
 from hnerf.asset.quads import polygon_corners
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import StagedAvatar, stage_avatar
@@ -389,3 +390,14 @@ def test_a_full_disk_is_named_as_such(missing: float, staged: StagedAvatar, tmp_
     write_usdz(path, {"": staged}, [], 10.0, INFO)
     with files_up_to(int((1 - missing) * path.stat().st_size)), pytest.raises(OSError, match="is the disk full"):
         write_usdz(path, {"": staged}, [], 10.0, INFO)
+
+
+def test_packages_need_no_room_in_the_folder_of_temporary_files(
+    staged: StagedAvatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is often small, or full, on a machine whose store is elsewhere."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "missing"))
+    write_usdz(tmp_path / "avatar.usdz", {"": staged}, [], 10.0, INFO)
+    write_cache(tmp_path / "avatar_cache.usdz", staged, [], 10.0, INFO)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["avatar.usdz", "avatar_cache.usdz"]
