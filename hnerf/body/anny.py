@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from safetensors import SafetensorError
 from torch import Tensor
 
 from hnerf.body.rig import Rig
+from hnerf.errors import PlaceError, one_line
 
 if TYPE_CHECKING:  # imported on first use: it takes seconds, which commands without a body can save
     import anny
@@ -48,14 +50,20 @@ BODY_25 = (
 
 @functools.cache
 def anny_model() -> "anny.Anny":
-    """Load the body model. anny builds it once, in about a minute, and caches it on disk; `make install` triggers
-    this."""
+    """Load the body model. anny builds it once, in about a minute, and caches it on disk; `make install` triggers this.
+    Raises PlaceError if the cache is damaged."""
     import anny
     from anny.models.model_data import TopologyConfig
     from anny.paths import get_anny_cache_path
 
     labels = [f"{part}-incr" for name in LOCAL_CHANGES for part in name.split("+")]
-    model = anny.Anny(topology=TopologyConfig(base_mesh="makehuman", eyes=False, tongue=False), local_changes=labels)
+    topology = TopologyConfig(base_mesh="makehuman", eyes=False, tongue=False)
+    try:
+        model = anny.Anny(topology=topology, local_changes=labels)
+    except SafetensorError as error:  # cut short, as by a copy that was interrupted
+        raise PlaceError(
+            f"{get_anny_cache_path()}: damaged ({one_line(error)}); delete this folder, and it is made again"
+        ) from None
     assert tuple(model.phenotype_labels) == PHENOTYPES
     for path in get_anny_cache_path().glob("*/*.safetensors"):  # anny keeps them to this user
         wanted = path.parent.stat().st_mode & 0o666

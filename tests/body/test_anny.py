@@ -1,14 +1,17 @@
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import anny
 import pytest
 import torch
 import trimesh
+from safetensors import SafetensorError
 
 from hnerf.body.anny import ADULT, BETA_NAMES, PHENOTYPES, _coefficients, anny_model, anny_rig, inner_skin
 from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import pose_vertices
+from hnerf.errors import PlaceError
 
 
 def test_the_average_adult_is_watertight_and_of_plausible_height() -> None:
@@ -38,6 +41,14 @@ def test_who_may_read_the_folder_of_the_prepared_model_may_read_its_files(
     monkeypatch.setattr("anny.paths._ANNY_CACHE_DIR", [tmp_path])
     anny_model.__wrapped__()
     assert (tmp_path / "v14" / "a.safetensors").stat().st_mode & 0o777 == mode
+
+
+def test_a_damaged_prepared_model_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is the machine's fault, not the recording's, and no result of a study."""
+    monkeypatch.setattr(anny, "Anny", Mock(side_effect=SafetensorError("header too small")))
+    monkeypatch.setattr("anny.paths._ANNY_CACHE_DIR", [tmp_path])
+    with pytest.raises(PlaceError, match=rf"^{tmp_path}: damaged \(header too small\); delete this folder"):
+        anny_model.__wrapped__()
 
 
 def test_mouth_and_eye_sockets_are_capped() -> None:
