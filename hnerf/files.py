@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
-from hnerf.errors import InputError
+from hnerf.errors import DISK_FULL, InputError
 
 
 @contextmanager
@@ -25,8 +25,20 @@ def atomic_folder(out: Path) -> Iterator[Path]:
     with made_folder(out.parent), tempfile.TemporaryDirectory(dir=out.parent, prefix=f"{out.name}.partial-") as beside:
         partial = Path(beside) / out.name  # unlike `beside`, it has the permissions of the umask
         partial.mkdir()
-        yield partial
+        with naming_full_disk(out):
+            yield partial
         os.replace(partial, out)
+
+
+@contextmanager
+def naming_full_disk(path: Path) -> Iterator[None]:
+    """Name `path` in an error about a full disk raised inside that names no file, as failed writes do not."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in DISK_FULL and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 @contextmanager
@@ -48,7 +60,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
     name `path`."""
     beside = path.with_name(f".{uuid4().hex}")
     try:
-        yield beside
+        with naming_full_disk(path):
+            yield beside
         os.replace(beside, path)
     except OSError as error:
         if str(error.filename) != str(beside):

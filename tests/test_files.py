@@ -2,6 +2,7 @@ import errno
 import os
 import time
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -104,3 +105,12 @@ def test_the_time_is_that_of_new_files_or_else_this_machines(tmp_path: Path) -> 
     (tmp_path / "a").touch()
     assert before_s <= (tmp_path / "a").stat().st_mtime <= now_s(tmp_path) and len(list(tmp_path.iterdir())) == 1
     assert abs(now_s(tmp_path / "missing") - time.time()) < 5
+
+
+@pytest.mark.parametrize("written", [atomic_file, atomic_folder])
+def test_the_error_of_a_full_disk_names_what_was_to_be_written(written: Any, tmp_path: Path) -> None:
+    """A failed write names no file."""
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}/ada'"), written(tmp_path / "ada"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.raises(OSError, match=r"Input/output error$"), written(tmp_path / "ada"):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
