@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import IO
 from uuid import uuid4
 
+from hnerf.files import naming_full_disk
+
 FOLDER = ".running"
 READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
 _own: dict[tuple[int, Path], IO[str]] = {}  # of this process and store; open until the process ends
@@ -19,7 +21,7 @@ _own: dict[tuple[int, Path], IO[str]] = {}  # of this process and store; open un
 
 def pin(store: Path, name: str) -> None:
     """Note that this process uses an artifact from now on. In a read-only store, nothing is noted."""
-    with unless_read_only():
+    with unless_read_only(), naming_full_disk(store):
         file = _own.get((os.getpid(), store)) or _begin(store)
         file.write(f"{name}\n")
         file.flush()

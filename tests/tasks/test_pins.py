@@ -41,6 +41,13 @@ def test_a_full_disk_is_not_treated_as_a_read_only_store() -> None:
         raise OSError(errno.ENOSPC, "full")
 
 
+def test_the_error_of_a_full_disk_names_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(pins, "_begin", lambda _: Mock(flush=Mock(side_effect=full)))
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}'"):
+        pin(tmp_path, "fit/1")
+
+
 def test_pins_work_on_nfs_and_may_be_removed_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """NFS allows an exclusive lock only on a file open for writing. A dangling link stands in for a removed file."""
     lock = fcntl.flock
