@@ -10,6 +10,7 @@ import numpy as np
 from hnerf.body.anny import anny_rig
 from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
+from hnerf.body.skeletons import EQUIVALENTS, exported_name
 from hnerf.capture.capture import to_8_bit, write_image
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.keypoint_files import write_openpose
@@ -39,14 +40,10 @@ SENSOR_NOISE = 1.0  # standard deviation, of 255
 MESH_EVERY = 4  # frames
 WAVING_AFTER_S = 0.3  # from the first novel pose until the arm is up
 
-# Mixamo's names of joints that have the same position in both rigs.
-MIXAMO = {
-    "root": "Hips", "neck01": "Neck", "head": "Head",
-    **{f"{anny}.{s}": f"{side}{name}" for s, side in (("L", "Left"), ("R", "Right")) for anny, name in (
-        ("upperarm01", "Arm"), ("lowerarm01", "ForeArm"), ("wrist", "Hand"),
-        ("upperleg01", "UpLeg"), ("lowerleg01", "Leg"), ("foot", "Foot"),
-    )},
-}  # fmt: skip
+# Joints that have the same position in Mixamo's skeleton, and their names there.
+LIMBS = ("upperarm01", "lowerarm01", "wrist", "upperleg01", "lowerleg01", "foot")
+SHARED_JOINTS = ("root", "neck01", "head", *(f"{limb}.{side}" for side in "LR" for limb in LIMBS))
+MIXAMO = {joint: EQUIVALENTS[exported_name(joint)].mixamo for joint in SHARED_JOINTS}
 BODY_25_NAMES = (
     "Nose", "Neck", "RShoulder", "RElbow", "RWrist", "LShoulder", "LElbow", "LWrist", "MidHip", "RHip", "RKnee",
     "RAnkle", "LHip", "LKnee", "LAnkle", "REye", "LEye", "REar", "LEar", "LBigToe", "LSmallToe", "LHeel", "RBigToe",
