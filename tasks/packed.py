@@ -32,10 +32,6 @@ SPARE_BYTES = 1 << 30  # on the disk, which an archive must leave free
 Name = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
 
-class NoRoomError(PlaceError):
-    """The files would fill the disk."""
-
-
 class ArchivedArtifact(Section):
     """An artifact's record. files: by their path in its folder."""
 
@@ -121,10 +117,10 @@ def read_contents(kind: type[Kind], archive: IO[bytes], where: str) -> Kind:
 
 
 def require_room(wanted_bytes: int, folder: Path, where: str) -> None:
-    """Raise NoRoomError if this many bytes would fill the disk."""
+    """Raise PlaceError if this many bytes would fill the disk."""
     free = shutil.disk_usage(folder).free
     if wanted_bytes > free - SPARE_BYTES:
-        raise NoRoomError(f"{where}: takes {wanted_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; make room")
+        raise PlaceError(f"{where}: takes {wanted_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; make room")
 
 
 def unpack(archive: IO[bytes], contents: Contents, scratch: Path, where: str) -> None:

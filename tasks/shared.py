@@ -11,10 +11,10 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 from tasks.bucket import Bucket
 from tasks.lease import leased
-from tasks.packed import Contents, NoRoomError, archived, pack, place, read_contents, require_room, unpack
+from tasks.packed import Contents, archived, pack, place, read_contents, require_room, unpack
 from tasks.shared_checkpoint import shared_checkpoint
 from tasks.store import Artifact, Store
 
@@ -65,7 +65,7 @@ def _fetch(bucket: Bucket, store: Store, stage: str, key: str) -> Artifact | Non
             return None
         try:
             contents = _unpacked(scratch, name, where)
-        except NoRoomError:
+        except PlaceError:  # the disk is full
             raise
         except InputError as error:
             log.warning("%s (%s is computed again)", error, stage)
