@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hnerf.body.normal_equations import NormalEquations
-from hnerf.body.robust import geman_mcclure
+from hnerf.body.normal_equations import NormalEquations, geman_mcclure
 
 BALANCE_M = 0.05  # standard deviation
 OUTLIER_M = 0.15  # distance in a step or a jump, where the prior lets go

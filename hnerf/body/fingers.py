@@ -11,11 +11,10 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.hand_points import OUTLIER_M, POINT_STD_M, SEEN, SIDES, finger_joints, hand_points, moved_onto_palm
-from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.normal_equations import NormalEquations, geman_mcclure
 from hnerf.body.pose_prior import add_turn_prior, turn_axes
 from hnerf.body.reprojection import Views, reprojection_term
 from hnerf.body.rig import Rig
-from hnerf.body.robust import geman_mcclure
 from hnerf.capture.timing import median_step
 
 # By segment, from the palm: flexion of a relaxed hand, and standard deviations of flexion, twist and spread, all in

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.articulation import Pose
-from hnerf.body.normal_equations import NormalEquations
-from hnerf.body.robust import geman_mcclure
+from hnerf.body.normal_equations import NormalEquations, geman_mcclure
 from hnerf.capture.standing import is_standing, stature_on_ground_m
 from hnerf.geometry.camera import Camera
 

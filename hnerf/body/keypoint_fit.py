@@ -12,12 +12,11 @@ from hnerf.body.body_model import BodyModel
 from hnerf.body.ground import Ground
 from hnerf.body.hand_points import PalmTerm
 from hnerf.body.limb_depths import LimbDepths
-from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.normal_equations import NormalEquations, geman_mcclure
 from hnerf.body.observations import Observations
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.posture_prior import PosturePrior
 from hnerf.body.reprojection import NEAR_M, DataTerm, reprojection_term
-from hnerf.body.robust import geman_mcclure
 from hnerf.config import FitSettings
 from hnerf.geometry.camera import Camera
 

@@ -7,9 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.normal_equations import NormalEquations, geman_mcclure
 from hnerf.body.observations import Observations
-from hnerf.body.robust import geman_mcclure
 from hnerf.capture.capture import Capture
 from hnerf.capture.keypoint_sets import SETS
 from hnerf.detection.merge import nearest_person

@@ -2,6 +2,7 @@
 
 The normal matrix is block-banded (each frame, its neighbour, and the one after) with a dense border for the shape, so a
 step costs time linear in the number of frames (Triggs et al. 1999, section 6: Schur complement of an arrow matrix).
+Robust terms are re-weighted at every step.
 """
 
 import numpy as np
@@ -80,3 +81,13 @@ def _bounded_solve(matrix: np.ndarray, target: np.ndarray, low: np.ndarray, high
         value[crossed] = value[crossed].clip(low[crossed], high[crossed])
         held |= crossed
     return value
+
+
+def geman_mcclure(squared: Tensor, sigma: float | Tensor, outlier: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Return Geman-McClure (1987) weights of re-weighted least squares for squared residuals, and the costs, both of
+    the residuals' shape.
+
+    A residual well below `outlier` costs half its square over sigma^2, one far beyond nearly outlier^2 / (2 sigma^2).
+    """
+    falloff = 1 + squared / outlier**2
+    return (sigma * falloff) ** -2, 0.5 * squared / sigma**2 / falloff

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.normal_equations import NormalEquations, geman_mcclure
 from hnerf.body.pose_prior import PosePrior
-from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
 # Standard deviation of a joint's turn, and deviation that means another posture.

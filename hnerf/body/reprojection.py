@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hnerf.body.robust import geman_mcclure
+from hnerf.body.normal_equations import geman_mcclure
 from hnerf.geometry.camera import Camera
 
 NEAR_M = 0.1  # least depth: nothing nearer is in a camera's image
