@@ -15,7 +15,7 @@ CHAIN_SD = 0.03  # relative error of a stature from limb lengths, due to how a d
 ANKLES, NECK = (11, 14), 1  # BODY_25
 FEET = ((11, 22, 23, 24), (14, 19, 20, 21))  # ankle, toes and heel of the right and of the left foot
 LEAN_SD = np.tan(np.deg2rad(6.0))  # of the mean direction from ankles to neck: people lean as they walk and reach
-ROLL_SD = np.deg2rad(3.0)  # of a camera about its line of sight: people hold and mount cameras level
+ROLL_SD = np.deg2rad(3.0)  # of a camera about its line of sight: people hold and mount cameras level, or on edge
 CONTACT_SD_M = 0.02  # of a standing foot's lowest keypoint above the ground
 STEP_S = 1 / 3  # duration of a step: its frames all say the same about the ground
 ROUNDS = 30  # of iteratively re-weighted least squares
@@ -63,14 +63,14 @@ def _upright(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) ->
 
     Three cues determine up. It is the normal (-a, -b, 1) of the ground z = a x + b y + c on which the lower keypoints
     of standing feet lie, as far as their path is wide enough; it is the mean direction from ankles to neck; and it is
-    perpendicular to the x axes of level cameras (Brown and Lowe 2007, section 5). Each cue has Cauchy weights, since a
-    foot may swing, a person may lean and a camera may be tilted.
+    perpendicular to the x axes of level cameras (Brown and Lowe 2007, section 5), or to the y axes of cameras on edge.
+    Each cue has Cauchy weights, since a foot may swing, a person may lean and a camera may be tilted.
     """
     world = _rotation(_body_direction(points_m))
     for scale in np.geomspace(FIRST_SCALE, 1, ROUNDS):
         feet_m = _lowest_of_feet(points_m @ world.T)
         body = world @ _body_direction(points_m)
-        sideways = np.stack([camera.R[0] for camera in cameras]) @ world.T
+        sideways = np.stack([min(camera.R[:2] @ world.T, key=lambda axis: abs(axis[2])) for camera in cameras])
         height_m = np.median(feet_m[:, 2]) if len(feet_m) else 0.0
         middle_m = feet_m.mean(0) if len(feet_m) else np.zeros(3)
         # Unknowns: the slopes a and b, and c - height_m. Each row is divided by its standard deviation.

@@ -138,11 +138,12 @@ def test_the_ground_is_put_below_the_feet_in_any_world() -> None:
     assert stood[0].centre_m[2] == pytest.approx(ring(4)[0].centre_m[2] - 0.02, abs=0.02)
 
 
-def test_a_leaning_person_does_not_tilt_level_cameras() -> None:
+@pytest.mark.parametrize("roll_deg", [0.0, 90.0, -90.0])
+def test_a_leaning_person_does_not_tilt_cameras_that_are_level_or_on_edge(roll_deg: float) -> None:
     lean = cv2.Rodrigues(np.array([0, np.deg2rad(20), 0]))[0]
     still = np.repeat((STANDING_M @ lean.T)[None], 12, axis=0)
-    stood, _, up_sd_deg = stand_on_ground(ring(4), still, 1 / 30)
-    assert max(abs(np.rad2deg(camera.R[0, 2])) for camera in stood) < 3
+    stood, _, up_sd_deg = stand_on_ground([turned(camera, roll_deg, axis=2) for camera in ring(4)], still, 1 / 30)
+    assert max(abs(np.rad2deg(turned(camera, -roll_deg, axis=2).R[0, 2])) for camera in stood) < 3
     assert up_sd_deg > 2  # the person and the cameras disagree, so the vertical is uncertain
 
 
