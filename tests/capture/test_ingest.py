@@ -67,7 +67,7 @@ def test_millimetres_become_metres(folder: Path, tmp_path: Path) -> None:
 def test_capture_toml_sets_names_and_splits(folder: Path, tmp_path: Path) -> None:
     (folder / "capture.toml").write_text(
         'name = "Ann B."\nfps = 12.5\nup = "y"\nlicence = "CC0"\n[cameras]\ntrain = ["02"]\ntest = ["01"]\n'
-        "[frames]\ntrain = [1, 3]\nnovel_pose = [4]\n"
+        "[frames]\ntrain = [3, 1]\nnovel_pose = [4]\n"
     )
     capture = ingest(folder, SETTINGS, tmp_path / "out")
     assert (capture.name, capture.fps, capture.up) == ("Ann B.", 12.5, "y")
