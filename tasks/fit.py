@@ -11,7 +11,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("fit", version="30")
+@stage("fit", version="31")
 def fit(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact | None, settings: FitSettings
 ) -> dict[str, float]:

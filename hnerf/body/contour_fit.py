@@ -7,6 +7,7 @@ from the skin. Where a mask lacks a limb, vertices far outside push no harder th
 """
 
 import logging
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -39,6 +40,7 @@ MAX_SOLE_M = 0.05  # between the skin and the ground
 BORDER_PX = 2.0  # margin at the image border, where every mask ends
 UNDERSIDE_M = 0.015  # height above the lowest vertex up to which others may touch the ground
 HUBER = 1.345  # standard deviations beyond which residuals push no harder; 95 % efficient on Gaussian noise
+DIVERGED = 1.5  # residuals relative to the least so far, from which on steps lead away
 DAMPING = 1e-4  # more would hold back depth and scale, which one camera's outlines hardly determine
 
 
@@ -159,12 +161,18 @@ def refine_with_outlines(
     """Refine a pose by Gauss-Newton steps on outlines and keypoints, renewing the matches before each step.
 
     edges: by frame and camera, None without a mask; ground: the world's vertical axis if a single camera sees a person
-    standing at height 0, else None; threads: number of frames to process in parallel.
+    standing at height 0, else None; threads: number of frames to process in parallel. Returns the best pose so far when
+    a step diverges, as with one camera, whose outlines hardly determine depth.
     """
     sole_m, steps = 0.0, problem.settings.contour_steps
+    best, least_mm = pose, math.inf
     for step in tracked(range(steps), "outlines", steps):
-        pose, sole_m, before_mm = _outline_step(problem, pose, edges, ground, sole_m, threads)
+        stepped, sole_m, before_mm = _outline_step(problem, pose, edges, ground, sole_m, threads)
         log.info("outlines, step %d of %d: %.1f mm rms", step + 1, steps, before_mm)
+        if before_mm > DIVERGED * least_mm:
+            return best
+        best, least_mm = (pose, before_mm) if before_mm < least_mm else (best, least_mm)
+        pose = stepped
     return pose
 
 

@@ -1,10 +1,14 @@
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
+from hnerf.body import contour_fit
 from hnerf.body.articulation import Articulation
 from hnerf.body.contour_fit import (
     ContourResiduals,
@@ -247,3 +251,12 @@ def test_a_sole_stands_on_the_ground() -> None:
     rows = _ground_contact(np.array([[0, 0, 0.3], [0, 0.1, 0.05]]), 2, 0.02)
     assert rows.vertices.tolist() == [1] and rows.gradient.tolist() == [[0, 0, 1]]
     np.testing.assert_allclose([rows.residual_m[0], rows.weight[0]], [0.03, 1e4 / 1.04**2])
+
+
+def test_steps_that_diverge_are_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The third pose fits best, and the fifth more than 1.5 times worse."""
+    rms_mm = iter([20.0, 10.0, 9.0, 11.0, 30.0, 40.0])
+    monkeypatch.setattr(contour_fit, "_outline_step", lambda problem, pose, *_: (pose + 1, 0.0, next(rms_mm)))
+    problem: Any = SimpleNamespace(settings=FitSettings(contour_steps=6))
+    first: Any = 0
+    assert contour_fit.refine_with_outlines(problem, first, [], None, 1) == 2
