@@ -99,14 +99,15 @@ class Surface:
         number closes a hole; there, too, a block takes the value of its centre.)
         """
         step_m = (upper_m - lower_m) / (nodes - 1)
-        occupied = np.zeros((nodes,) * 3, bool)
+        occupied = np.zeros((nodes // BLOCKS[0],) * 3, bool)
         blocks = _cube(nodes // BLOCKS[0])
-        for side in BLOCKS:
+        for side in BLOCKS[:-1]:
             middles_m = lower_m + (blocks * side + (side - 1) / 2) * step_m
-            to_split = (side > 1) & self.near(middles_m, (side - 1) / 2 * float(np.linalg.norm(step_m)))
-            members = (blocks[~to_split] * side)[:, None] + _cube(side)
-            occupied[tuple(np.moveaxis(members, -1, 0))] = self.inside(middles_m[~to_split])[:, None]
+            to_split = self.near(middles_m, (side - 1) / 2 * float(np.linalg.norm(step_m)))
+            occupied[tuple(blocks[~to_split].T)] = self.inside(middles_m[~to_split])
+            occupied = occupied.repeat(2, 0).repeat(2, 1).repeat(2, 2)
             blocks = ((blocks[to_split] * 2)[:, None] + _cube(2)).reshape(-1, 3)
+        occupied[tuple(blocks.T)] = self.inside(lower_m + blocks * step_m)
         return occupied
 
     def _flags(self, kernel: wp.Kernel, points_m: np.ndarray, *more: wp.array | float) -> np.ndarray:
