@@ -20,6 +20,7 @@ from hnerf.warp_import import wp
 OUTLIER = 0.15  # of a colour in [0, 1]: what differs more from the field is another limb or a passing shadow
 COSINE_POWER = 4  # a view's weight is this power of the cosine of its angle to the normal
 EDGE_PX = 5  # neighbourhood in which a jump in depth marks an outline, whose pixels mix two surfaces
+FEATHER_PX = 8.0  # from an outline inwards, over which a view's weight rises, so that its end leaves no seam
 EDGE_SLOPE = 2.5  # depth over width, above which a slope counts as a jump; views so oblique hardly count anyway
 DEPTH_TOLERANCE_M = 0.01
 FAR_M = 1e3  # depth where a ray hits nothing
@@ -91,10 +92,12 @@ class BackProjection:
 @dataclass(frozen=True)
 class SeenTexels:
     """Texels as a photograph shows them. pixels: those that contain them; cosine (M,): between the view and their unit
-    normals (M, 3); colours (M, 3): in [0, 1], interpolated between pixels and divided by the camera's gains."""
+    normals (M, 3); feather (M,): in (0, 1], below 1 next to outlines; colours (M, 3): in [0, 1], interpolated between
+    pixels and divided by the camera's gains."""
 
     pixels: TexelPixels
     cosine: np.ndarray
+    feather: np.ndarray
     normals: np.ndarray
     colours: np.ndarray
 
@@ -104,10 +107,10 @@ class SeenTexels:
         return self.pixels.index
 
     def weights(self, expected: np.ndarray) -> np.ndarray:
-        """Return the weight of each texel, (M, 1): the fourth power of the cosine, reduced the more its colour
-        contradicts the expected one (M, 3) (Geman-McClure)."""
+        """Return the weight of each texel, (M, 1): the fourth power of the cosine, reduced next to outlines, and the
+        more its colour contradicts the expected one (M, 3) (Geman-McClure)."""
         error = (self.colours - expected) / OUTLIER
-        return (self.cosine**COSINE_POWER / (1 + _dot(error, error)) ** 2)[:, None]
+        return (self.feather * self.cosine**COSINE_POWER / (1 + _dot(error, error)) ** 2)[:, None]
 
 
 class CapturedBlend:
@@ -142,12 +145,12 @@ def photographed_texels(
         frame, name = view
         camera, gain = capture.cameras[name], np.array(gains.get(name, (1.0, 1.0, 1.0)), np.float32)
         image = capture.image(name, frame)
-        index, cosine, normals, pixels_px = visible_texels(camera, surfaces[frame], texels)
+        index, cosine, feather, normals, pixels_px = visible_texels(camera, surfaces[frame], texels)
         x, y = np.round(pixels_px).astype(int).T
         at, pixel = np.unique(y * camera.width_px + x, return_inverse=True)
         colours = (image.reshape(-1, 3)[at] / 255 / gain).astype(np.float32)
         pixels = TexelPixels(index.astype(np.int32), pixel.astype(np.int32), colours)
-        return SeenTexels(pixels, cosine, normals, sampled(image, pixels_px) / gain)
+        return SeenTexels(pixels, cosine, feather, normals, sampled(image, pixels_px) / gain)
 
     views = list(product(surfaces, capture.train_cameras))
     yield from tracked(side_by_side(seen_in, views), "photographs", len(views))
@@ -155,9 +158,9 @@ def photographed_texels(
 
 def visible_texels(
     camera: Camera, surface: SeenSurface, texels: Texels
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return which texels (M,) a camera sees away from outlines, the cosines of its view to their normals (M,), these
-    unit normals (M, 3), and their pixels (M, 2)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return which texels (M,) a camera sees away from outlines, the cosines of its view to their normals (M,), the
+    share of FEATHER_PX by which they are away (M,), at most 1, these unit normals (M, 3), and their pixels (M, 2)."""
     vertices_m, faces, normals = surface.vertices_m, surface.faces, surface.normals
     towards = camera.centre_m - vertices_m
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -174,7 +177,9 @@ def visible_texels(
     inside = camera.holds(at_px) & (cosine > 0) & (depth_m > 0)  # what is behind the camera would be seen mirrored
     column, row = np.where(inside[:, None], at_px, 0).astype(int).T
     visible = inside & ~outline[row, column] & (distance_m < seen_m[row, column] + DEPTH_TOLERANCE_M / cosine.clip(0.1))
-    return index[visible], cosine[visible], normal[visible], pixels_px[visible]
+    away_px = cv2.distanceTransform((~outline).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)[row, column]
+    feather = (away_px / FEATHER_PX).clip(max=1)
+    return index[visible], cosine[visible], feather[visible], normal[visible], pixels_px[visible]
 
 
 def _depth(camera: Camera, surface: SeenSurface) -> tuple[np.ndarray, np.ndarray]:

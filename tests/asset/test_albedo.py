@@ -15,7 +15,7 @@ ALBEDO = np.array([[0.8, 0.4, 0.2]])
 
 def seen(normal: np.ndarray, colours: np.ndarray) -> SeenTexels:
     """Return what a photograph taken along the normal shows of the first texel."""
-    return SeenTexels(TexelPixels(np.array([0]), np.array([0]), colours), np.ones(1), normal[None], colours)
+    return SeenTexels(TexelPixels(np.array([0]), np.array([0]), colours), np.ones(1), np.ones(1), normal[None], colours)
 
 
 def test_albedo_is_recovered_from_any_illumination() -> None:

@@ -14,6 +14,7 @@ from hnerf.asset.photographs import (
     BackProjection,
     CapturedBlend,
     SeenSurface,
+    SeenTexels,
     TexelPixels,
     photographed_texels,
     sampled,
@@ -71,7 +72,7 @@ def colours_from_photographs(
 
 
 def test_a_texel_is_seen_where_it_projects() -> None:
-    index, cosine, normals, pixels_px = visible_texels(
+    index, cosine, _, normals, pixels_px = visible_texels(
         camera(), SeenSurface.of(square(0.4, 0.0), FACES), texels_at([0], [[0.5, 0.25, 0.25]])
     )
     assert index.tolist() == [0]
@@ -86,7 +87,7 @@ def test_normals_between_corners_are_normalised() -> None:
     bend = np.pi / 4
     folded_m = np.array([[-0.2, 0, 0], [0, -0.2, 0], [0, 0.2, 0], [0.2 * np.cos(bend), 0, 0.2 * np.sin(bend)]])
     fold = SeenSurface.of(folded_m, np.array([[0, 2, 1], [1, 2, 3]]))
-    _, cosine, normals, _ = visible_texels(camera(), fold, texels_at([0], [[0.5, 0.25, 0.25]]))
+    _, cosine, _, normals, _ = visible_texels(camera(), fold, texels_at([0], [[0.5, 0.25, 0.25]]))
     np.testing.assert_allclose(normals, [[np.sin(bend / 4), 0, -np.cos(bend / 4)]], atol=1e-6)
     np.testing.assert_allclose(cosine, np.cos(bend / 4 - np.arctan(0.1 / 2)), atol=1e-6)
 
@@ -94,10 +95,10 @@ def test_normals_between_corners_are_normalised() -> None:
 def test_occluded_and_back_facing_squares_are_hidden() -> None:
     vertices_m = np.concatenate([square(0.4, 0.0), square(0.4, -0.3)])
     both = np.concatenate([FACES, FACES + 4])
-    index, _, _, _ = visible_texels(camera(), SeenSurface.of(vertices_m, both), texels_at([0, 2], [MIDDLE, MIDDLE]))
+    index, *_ = visible_texels(camera(), SeenSurface.of(vertices_m, both), texels_at([0, 2], [MIDDLE, MIDDLE]))
     assert index.tolist() == [1]
     averted = SeenSurface.of(square(0.4, 0.0), FACES[:, ::-1].copy())
-    index, _, _, _ = visible_texels(camera(), averted, texels_at([0], [MIDDLE]))
+    index, *_ = visible_texels(camera(), averted, texels_at([0], [MIDDLE]))
     assert len(index) == 0
 
 
@@ -107,14 +108,14 @@ def test_a_surface_that_reaches_past_the_camera_still_hides_what_is_behind_it() 
     beside_m = np.array([[0, 5, -2], [0.1, 5, -1.9], [0, 5, -1.9]])
     vertices_m = np.concatenate([square(0.4, 0.0), square(0.4, -0.3), beside_m])
     faces = np.concatenate([FACES, FACES + 4, [[8, 9, 10]]])
-    index, _, _, _ = visible_texels(camera(), SeenSurface.of(vertices_m, faces), texels_at([0, 2], [MIDDLE, MIDDLE]))
+    index, *_ = visible_texels(camera(), SeenSurface.of(vertices_m, faces), texels_at([0, 2], [MIDDLE, MIDDLE]))
     assert index.tolist() == [1]
 
 
 def test_a_square_behind_the_camera_is_not_seen() -> None:
     """The square is 2 m behind the camera and faces it; it projects, mirrored, to the middle of the image."""
     behind = SeenSurface.of(square(0.4, -4.0), FACES[:, ::-1].copy())
-    index, _, _, _ = visible_texels(camera(), behind, texels_at([0], [MIDDLE]))
+    index, *_ = visible_texels(camera(), behind, texels_at([0], [MIDDLE]))
     assert len(index) == 0
 
 
@@ -123,7 +124,7 @@ def test_a_slanted_surface_does_not_occlude_itself() -> None:
     1.7 cm farther away than the point that the ray hits, which is less than 1 cm / cos 60."""
     share = np.linspace(0.38, 0.5, 50)  # weight of corner 0, for x from 0.1 m to 0
     texels = texels_at([0] * 50, [[s, 0.5, 0.5 - s] for s in share.tolist()])
-    index, cosine, _, _ = visible_texels(camera("side", np.pi / 3), SeenSurface.of(square(0.4, 0.0), FACES), texels)
+    index, cosine, *_ = visible_texels(camera("side", np.pi / 3), SeenSurface.of(square(0.4, 0.0), FACES), texels)
     assert index.tolist() == list(range(50))
     assert cosine[-1] == pytest.approx(0.5)
 
@@ -134,9 +135,21 @@ def test_texels_near_an_outline_are_left_out() -> None:
     at_px = np.array([31.0, 34.0, 66.0, 69.0])
     share = (at_px - 30) / 40  # along the diagonal from corner 0 to corner 2
     texels = texels_at([0] * 4, [[1 - s, s, 0] for s in share.tolist()])
-    index, _, _, pixels_px = visible_texels(camera(), SeenSurface.of(square(0.4, 0.0), FACES), texels)
+    index, *_, pixels_px = visible_texels(camera(), SeenSurface.of(square(0.4, 0.0), FACES), texels)
     assert index.tolist() == [1, 2]
     np.testing.assert_allclose(pixels_px, [[34, 34], [66, 66]], atol=1e-4)
+
+
+def test_weights_rise_over_eight_pixels_from_an_outline() -> None:
+    """The square ends at 30 and at 70 px; the last pixels next to a jump in depth are 31 and 69."""
+    at_px = np.array([34.0, 36.0, 45.0, 67.0])
+    share = (at_px - 30) / 40
+    texels = texels_at([0] * 4, [[1 - s, s, 0] for s in share.tolist()])
+    _, _, feather, normals, _ = visible_texels(camera(), SeenSurface.of(square(0.4, 0.0), FACES), texels)
+    np.testing.assert_allclose(feather, [3 / 8, 5 / 8, 1, 2 / 8])
+    pixels = TexelPixels(np.arange(4), np.arange(4), np.full((4, 3), 0.5))
+    weights = SeenTexels(pixels, np.ones(4), feather, normals, pixels.colours).weights(pixels.colours)
+    np.testing.assert_allclose(weights[:, 0], feather)
 
 
 def test_colours_are_weighted_by_the_fourth_power_of_the_cosine(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,7 +160,7 @@ def test_colours_are_weighted_by_the_fourth_power_of_the_cosine(monkeypatch: pyt
     found = colours_from_photographs(
         capture({"front": 130, "side": 125}, cameras),
         {},
-        {0: square(0.4, 0.0)},
+        {0: square(0.8, 0.0)},
         FACES,
         texels_at([0], [MIDDLE]),
         np.full((1, 3), 0.5),
