@@ -72,7 +72,12 @@ def main() -> None:
     where |= {"preset": options.preset, "at_once": options.at_once}
     captures = json.loads(found.read_text())["captures"] if found.exists() else {}
     settings = load_settings(options.preset).training
-    with ProcessPoolExecutor(options.at_once, get_context("spawn"), initializer=start_process) as processes:
+    with ProcessPoolExecutor(
+        options.at_once,
+        get_context("spawn"),
+        initializer=start_process,
+        max_tasks_per_child=1,  # peak memory is that of a process, and of one training
+    ) as processes:
         subjects = {name: options.store / "subjects" / name for name in options.captures}
         started = {name: start(subject, settings, options.out, processes) for name, subject in subjects.items()}
         for name, trainings in started.items():
