@@ -6,6 +6,7 @@ import logging
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -96,3 +97,10 @@ def s3() -> Iterator[str]:
         S3FileSystem().mkdir("tests")
         yield "s3://tests/shared"
         running.stop()
+
+
+@pytest.fixture(params=[-300, 300])
+def wrong_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let this machine's clock be five minutes slow, and then fast."""
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + request.param)

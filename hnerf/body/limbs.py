@@ -68,6 +68,6 @@ def _distances_m(points_m: Tensor, limb: Tensor) -> Tensor:
     near_m = points_m - NEAR_M * (points_m.mean(0) / NEAR_M).round()
     distances_m = points_m.new_full((len(points_m), len(FIRST_JOINTS) + 1), torch.inf)
     for k in limb.unique().tolist():
-        own, others = near_m[limb == k], near_m[limb != k]
-        distances_m[limb != k, k] = torch.cdist(others, own).amin(1)
+        own = limb == k
+        distances_m[~own, k] = torch.cdist(near_m[~own], near_m[own]).amin(1)
     return distances_m

@@ -103,12 +103,8 @@ def test_folders_being_written_and_hidden_or_empty_folders_are_not_started(watch
     assert look(watched) == ["ada", "bob"]
 
 
-@pytest.mark.parametrize("ahead_s", [-300, 300])
-def test_captures_on_a_share_whose_clock_differs_wait_no_longer_or_shorter(
-    ahead_s: float, watched: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = time.time
-    monkeypatch.setattr(time, "time", lambda: now() + ahead_s)
+@pytest.mark.usefixtures("wrong_clock")
+def test_captures_on_a_share_whose_clock_differs_wait_no_longer_or_shorter(watched: Path) -> None:
     assert look(watched, settle_s=60.0) == []
     assert look(watched) == ["ada", "bob"]
 
