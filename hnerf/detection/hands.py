@@ -13,7 +13,7 @@ from hnerf.capture.people import person_heights_px
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import write_points
 from hnerf.detection.network import Network
-from hnerf.detection.region import Region
+from hnerf.detection.region import Region, upright_angle
 from hnerf.files import copy_folder
 from hnerf.models import HAND_LANDMARKS
 from hnerf.progress import tracked
@@ -95,7 +95,7 @@ def forearm_region(elbow_px: np.ndarray, wrist_px: np.ndarray, height_px: float)
     """Return the region, fingers up, in which a forearm's hand must be. height_px: of the person in the image."""
     along = wrist_px - elbow_px
     length_px = float(np.linalg.norm(along))
-    return Region(wrist_px + REACH * along, SIDE * max(length_px, SHORTEST * height_px), _angle(along))
+    return Region(wrist_px + REACH * along, SIDE * max(length_px, SHORTEST * height_px), upright_angle(along))
 
 
 def hand_region(points_px: np.ndarray) -> Region:
@@ -105,9 +105,4 @@ def hand_region(points_px: np.ndarray) -> Region:
     axes = np.stack([up, [-up[1], up[0]]])
     low, high = (limit(points_px[PALM] @ axes.T, axis=0) for limit in (np.min, np.max))
     size_px = max(float((high - low).max()), 1.0)
-    return Region((low + high) / 2 @ axes + AHEAD * size_px * up, AROUND * size_px, _angle(up))
-
-
-def _angle(up: np.ndarray) -> float:
-    """Return the angle of a region whose upper side points in a direction `up` in the image."""
-    return math.pi / 2 - math.atan2(-up[1], up[0])
+    return Region((low + high) / 2 @ axes + AHEAD * size_px * up, AROUND * size_px, upright_angle(up))

@@ -60,8 +60,13 @@ class Region(NamedTuple):
 def region_around(middle_px: np.ndarray, end_px: np.ndarray) -> Region:
     """Return the region around a person, given the middle of the hips and the point above the head at which the circle
     around the person ends."""
-    across, up = end_px[0] - middle_px[0], middle_px[1] - end_px[1]
-    return Region(middle_px, MARGIN * math.hypot(across, up), math.pi / 2 - math.atan2(up, across))
+    up = end_px - middle_px
+    return Region(middle_px, MARGIN * math.hypot(*up), upright_angle(up))
+
+
+def upright_angle(up: np.ndarray) -> float:
+    """Return the angle of a region whose upper side points in a direction `up` (2,) in the image."""
+    return math.pi / 2 - math.atan2(-up[1], up[0])
 
 
 def image_region(size_px: tuple[int, int]) -> Region:

@@ -1,0 +1,186 @@
+"""The face: the rest body's features, moved to where a network sees them in photographs.
+
+The network also looks at the fitted body, rendered into the same places: what it gets wrong in both cancels.
+"""
+
+import dataclasses
+import logging
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from scipy.spatial.distance import cdist
+
+from hnerf.body.descriptor import normals_of
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.reprojection import project
+from hnerf.body.rig import Rig, pose_vertices, vertex_skinning
+from hnerf.capture.capture import Capture
+from hnerf.detection.faces import POINTS, SIZE, FaceNetwork
+from hnerf.detection.region import Region, upright_angle
+from hnerf.evenly_spaced import evenly_spaced
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.rays import cast, mesh_on_cpu
+from hnerf.side_by_side import side_by_side
+from hnerf.warp_import import wp
+
+log = logging.getLogger("hnerf.fit")
+
+RIGHT_EYE, LEFT_EYE, EARS = 15, 16, [17, 18]  # of BODY_25
+TOWARDS_EARS, BELOW_M, SIDE_M = 0.3, 0.035, 0.3  # a head's region: its middle from the eyes, and its side
+MOST_VIEWS = 24
+FACING = 0.5  # least cosine between where the face looks and the direction to the camera
+LEAST_SIDE_PX = 24  # of a region: with fewer pixels, no face can be found
+FOUND = 0.9  # least probability of a face in a photograph
+LEAST_VIEWS = 3
+LIGHT = np.array([0, -0.6, -0.8])  # direction towards the light in camera axes: from above, behind the camera
+# Standard deviation of a point's difference, alike in all photographs of a camera; and where it counts as an outlier.
+POINT_STD_M, OUTLIER_M = 0.002, 0.02
+CHANGE_STD_M = np.array([0.01, 0.001, 0.01])  # a priori, to the left, ahead and up: views from the front hide depth
+SOLVES = 5  # each with the weights that the one before leaves
+REACH_M = 0.015  # standard deviation of the Gaussian by which the skin follows the points around it
+
+
+@dataclass(frozen=True)
+class Look:
+    """A photograph that may show the face, in a region."""
+
+    camera: Camera
+    frame: int
+    region: Region
+
+
+@dataclass(frozen=True)
+class FaceView:
+    """The points of the face in one photograph. camera: its name; rest_m (468, 3): where the network's points on the
+    rendered body lie at rest, NaN where they miss it; seen_m (468, 2): how much farther right and down they are in the
+    photograph, at the body's depth; by_rest (468, 2, 3): the derivative of that by the rest position."""
+
+    camera: str
+    rest_m: np.ndarray
+    seen_m: np.ndarray
+    by_rest: np.ndarray
+
+
+def fit_face(capture: Capture, fit: BodyFit) -> BodyFit:
+    """Return the fit with the face of its rest body moved to where photographs of the training frames show it; the same
+    fit if fewer than LEAST_VIEWS show it.
+
+    One camera does not tell a head that is turned from one that is wider, so its fit is returned unchanged, too. Raises
+    InputError if the network is missing.
+    """
+    if len(capture.train_cameras) == 1:
+        return fit
+    network, looks = FaceNetwork(), evenly_spaced(looks_at_face(capture, fit), MOST_VIEWS)
+
+    def view(look: Look) -> FaceView | None:
+        return _view(capture.image(look.camera.name, look.frame), look, fit, network)
+
+    views = [found for found in side_by_side(view, looks) if found]
+    log.info("face: found in %d of %d photographs", len(views), len(looks))
+    if len(views) < LEAST_VIEWS:
+        return fit
+    points_m, changes_m = changes(views, rest_axes(fit.rig)[1])
+    return dataclasses.replace(fit, rig=moved_face(fit.rig, points_m, changes_m))
+
+
+def looks_at_face(capture: Capture, fit: BodyFit) -> list[Look]:
+    """Return the training cameras and frames in which the body looks towards the camera and the whole head is in the
+    image."""
+    looks = []
+    for frame in capture.train_frames:
+        vertices_m = pose_vertices(fit.rig, *fit.pose(frame))
+        middle_m, (_, ahead, up) = face_axes((fit.rig.keypoint_weights @ vertices_m).double().numpy())
+        for camera in (capture.cameras[name] for name in capture.train_cameras):
+            towards = camera.centre_m - middle_m
+            pixels, (depth_m, _) = camera.project(np.stack([middle_m, middle_m + 0.1 * up]))
+            side_px = SIDE_M * camera.K[0, 0] / depth_m
+            region = Region(pixels[0], side_px, upright_angle(pixels[1] - pixels[0]))
+            corners_px = region.to_image(np.array([[0, 0], [0, 1], [1, 0], [1, 1]]), 1)
+            if towards @ ahead > FACING * np.linalg.norm(towards) and camera.holds(corners_px).all():
+                looks += [Look(camera, frame, region)] if side_px >= LEAST_SIDE_PX else []
+    return looks
+
+
+def face_axes(keypoints_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middle of a head's region (3,), and unit vectors to the face's left, ahead and up (3, 3), from BODY_25
+    keypoints (25, 3)."""
+    eyes_m, ears_m = keypoints_m[[RIGHT_EYE, LEFT_EYE]].mean(0), keypoints_m[EARS].mean(0)
+    left = keypoints_m[LEFT_EYE] - keypoints_m[RIGHT_EYE]
+    left = left / np.linalg.norm(left)
+    ahead = eyes_m - ears_m - (eyes_m - ears_m) @ left * left
+    ahead = ahead / np.linalg.norm(ahead)
+    up = np.cross(ahead, left)
+    return eyes_m + TOWARDS_EARS * (ears_m - eyes_m) - BELOW_M * up, np.stack([left, ahead, up])
+
+
+def rest_axes(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Return `face_axes` of a body at rest."""
+    return face_axes((rig.keypoint_weights @ rig.vertices_m).double().numpy())
+
+
+def changes(views: list[FaceView], axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rest positions of the points (K, 3) that any view has, and how they must change (K, 3): robust least
+    squares, in which all views of a camera together count as one. axes (3, 3): of the face at rest."""
+    missed = np.isnan([view.rest_m[:, 0] for view in views])
+    some = ~missed.all(0)
+    seen_m, by_rest = (np.array([getattr(view, name)[some] for view in views]) for name in ("seen_m", "by_rest"))
+    names = [view.camera for view in views]
+    trust = ~missed[:, some] / (POINT_STD_M**2 * np.array([[names.count(name)] for name in names]))
+    prior, change_m = axes.T / CHANGE_STD_M**2 @ axes, np.zeros((some.sum(), 3))
+    for _ in range(SOLVES):
+        off_m = seen_m - np.einsum("vkic,kc->vki", by_rest, change_m)
+        weight = trust / (1 + ((off_m / OUTLIER_M) ** 2).sum(-1)) ** 2  # Geman-McClure
+        matrix = np.einsum("vk,vkic,vkid->kcd", weight, by_rest, by_rest) + prior
+        pull = np.einsum("vk,vkic,vki->kc", weight, by_rest, seen_m)
+        change_m = np.linalg.solve(matrix, pull[..., None])[..., 0]
+    return np.nanmedian([view.rest_m[some] for view in views], 0), change_m
+
+
+def moved_face(rig: Rig, points_m: np.ndarray, changes_m: np.ndarray) -> Rig:
+    """Return the rig with its skin moved as points (K, 3) of the face change (K, 3), left and right alike.
+
+    A vertex moves by the mean over points and their mirror images, weighted by a Gaussian of the distance, and over a
+    weight of 1 that stays: far from all points, nothing moves.
+    """
+    middle_m, (left, _, _) = rest_axes(rig)
+    mirrored = np.eye(3) - 2 * np.outer(left, left)
+    points_m = np.concatenate([points_m, middle_m + (points_m - middle_m) @ mirrored])
+    weight = np.exp(-((cdist(rig.vertices_m.double().numpy(), points_m) / REACH_M) ** 2) / 2)
+    moved_m = weight @ np.concatenate([changes_m, changes_m @ mirrored]) / (1 + weight.sum(1, keepdims=True))
+    return dataclasses.replace(rig, vertices_m=rig.vertices_m + torch.from_numpy(moved_m).to(rig.vertices_m))
+
+
+def _view(image: np.ndarray, look: Look, fit: BodyFit, network: FaceNetwork) -> FaceView | None:
+    """Return the points of the face in a photograph; None if the network finds no face there."""
+    camera, region, faces = look.camera, look.region, fit.rig.faces.numpy()
+    seen, probability = network(region.crop(image, SIZE))
+    if probability < FOUND:
+        return None
+    rest_m = fit.rig.vertices_m.double()
+    skinning = vertex_skinning(fit.rig, *fit.pose(look.frame)).double()
+    turn = skinning[..., :3]
+    vertices_m = ((turn @ rest_m[..., None])[..., 0] + skinning[..., 3]).numpy()
+    mesh = mesh_on_cpu(vertices_m, faces)
+    rendered, _ = network(_rendered(mesh, normals_of(vertices_m, faces), faces, look))
+    hits = cast(mesh, *camera.rays(region.to_image(rendered, SIZE)))
+    met = np.full((POINTS, 15), np.nan)  # at the points: position at rest, position, turn from rest
+    met[hits.face >= 0] = hits.interpolate(np.hstack([rest_m.numpy(), vertices_m, turn.flatten(1).numpy()]), faces)
+    metres = SIDE_M / region.side_px  # a pixel spans
+    by_world = project(camera, torch.from_numpy(met[:, 3:6]))[1].numpy()
+    by_rest = metres * by_world @ met[:, 6:].reshape(-1, 3, 3)
+    seen_m = metres * (region.to_image(seen, SIZE) - region.to_image(rendered, SIZE))
+    return FaceView(camera.name, met[:, :3], seen_m, np.nan_to_num(by_rest))
+
+
+def _rendered(mesh: wp.Mesh, normals: np.ndarray, faces: np.ndarray, look: Look) -> np.ndarray:
+    """Render a body with vertex normals (V, 3) in grey on white, as sharp as the photograph, (SIZE, SIZE, 3) uint8."""
+    size = min(SIZE, round(look.region.side_px))
+    places = np.stack(np.meshgrid(*2 * [np.arange(size) + 0.5]), -1).reshape(-1, 2)
+    hits = cast(mesh, *look.camera.rays(look.region.to_image(places, size)))
+    lit = (hits.interpolate(normals, faces) @ look.camera.R.T @ LIGHT).clip(0, 1)
+    picture = np.full(size**2, 255, np.uint8)
+    picture[hits.face >= 0] = 105 + 105 * lit
+    enlarged = cv2.resize(picture.reshape(size, size), (SIZE, SIZE), interpolation=cv2.INTER_LINEAR)
+    return np.repeat(enlarged[..., None], 3, -1)
