@@ -34,7 +34,7 @@ POSE_WIDTH = 8
 NODES = 128  # about 12 cm apart; finer detail, such as a collar, is left to the canonical surface
 RAYS_PER_PIXEL = 1.5  # of the person; about half of all rays meet the person
 MIN_STEPS, MAX_STEPS = 600, 4000
-STEPS_PER_FRAME = 540  # with a frame's rays, until its body's depth converges with one camera
+STEPS_PER_FRAME = 270  # with a frame's rays, until its body's depth converges with one camera
 
 
 @dataclass(frozen=True)

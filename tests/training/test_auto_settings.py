@@ -100,15 +100,15 @@ def test_steps_are_limited(person_px: int, steps: int):
 
 @pytest.mark.parametrize(
     ("cameras", "frames", "rate", "steps"),
-    [(1, 40, 5e-4, 2160), (4, 40, 5e-4, 600), (1, 1, 5e-4, 600), (1, 40, 0, 600)],
+    [(1, 40, 5e-4, 1080), (4, 40, 5e-4, 600), (1, 1, 5e-4, 600), (1, 40, 0, 600)],
 )
 def test_one_camera_gets_more_steps_to_find_the_depth_of_bodies(cameras: int, frames: int, rate: float, steps: int):
-    """540 steps per frame for 40 frames at 10 frames per step are 2160; one frame or given poses need no depth
+    """270 steps per frame for 40 frames at 10 frames per step are 1080; one frame or given poses need no depth
     search."""
     scene = replace(SCENE, cameras=cameras, frames=frames, person_px=1000)
     settings, decisions = decided(scene, pose_learning_rate=rate)
     assert settings.steps == steps
-    assert ("depths of 40 bodies" in decisions["steps"].reason) == (steps == 2160)
+    assert ("depths of 40 bodies" in decisions["steps"].reason) == (steps == 1080)
 
 
 def test_with_nearly_one_pose_the_pose_network_is_minimal():
