@@ -43,7 +43,7 @@ REACH_M = 0.015  # standard deviation of the Gaussian by which the skin follows 
 
 
 @dataclass(frozen=True)
-class Look:
+class Photograph:
     """A photograph that may show the face, in a region."""
 
     camera: Camera
@@ -72,23 +72,23 @@ def fit_face(capture: Capture, fit: BodyFit) -> BodyFit:
     """
     if len(capture.train_cameras) == 1:
         return fit
-    network, looks = FaceNetwork(), evenly_spaced(looks_at_face(capture, fit), MOST_VIEWS)
+    network, photographs = FaceNetwork(), evenly_spaced(photographs_of_face(capture, fit), MOST_VIEWS)
 
-    def view(look: Look) -> FaceView | None:
-        return _view(capture.image(look.camera.name, look.frame), look, fit, network)
+    def view(photo: Photograph) -> FaceView | None:
+        return _view(capture.image(photo.camera.name, photo.frame), photo, fit, network)
 
-    views = [found for found in side_by_side(view, looks) if found]
-    log.info("face: found in %d of %d photographs", len(views), len(looks))
+    views = [found for found in side_by_side(view, photographs) if found]
+    log.info("face: found in %d of %d photographs", len(views), len(photographs))
     if len(views) < LEAST_VIEWS:
         return fit
     points_m, changes_m = changes(views, rest_axes(fit.rig)[1])
     return dataclasses.replace(fit, rig=moved_face(fit.rig, points_m, changes_m))
 
 
-def looks_at_face(capture: Capture, fit: BodyFit) -> list[Look]:
-    """Return the training cameras and frames in which the body looks towards the camera and the whole head is in the
-    image."""
-    looks = []
+def photographs_of_face(capture: Capture, fit: BodyFit) -> list[Photograph]:
+    """Return the photographs, of training cameras and frames, in which the body looks towards the camera and the whole
+    head is in the image."""
+    photographs = []
     for frame in capture.train_frames:
         vertices_m = pose_vertices(fit.rig, *fit.pose(frame))
         middle_m, (_, ahead, up) = face_axes((fit.rig.keypoint_weights @ vertices_m).double().numpy())
@@ -99,8 +99,8 @@ def looks_at_face(capture: Capture, fit: BodyFit) -> list[Look]:
             region = Region(pixels[0], side_px, upright_angle(pixels[1] - pixels[0]))
             corners_px = region.to_image(np.array([[0, 0], [0, 1], [1, 0], [1, 1]]), 1)
             if towards @ ahead > FACING * np.linalg.norm(towards) and camera.holds(corners_px).all():
-                looks += [Look(camera, frame, region)] if side_px >= LEAST_SIDE_PX else []
-    return looks
+                photographs += [Photograph(camera, frame, region)] if side_px >= LEAST_SIDE_PX else []
+    return photographs
 
 
 def face_axes(keypoints_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -152,18 +152,18 @@ def moved_face(rig: Rig, points_m: np.ndarray, changes_m: np.ndarray) -> Rig:
     return dataclasses.replace(rig, vertices_m=rig.vertices_m + torch.from_numpy(moved_m).to(rig.vertices_m))
 
 
-def _view(image: np.ndarray, look: Look, fit: BodyFit, network: FaceNetwork) -> FaceView | None:
+def _view(image: np.ndarray, photo: Photograph, fit: BodyFit, network: FaceNetwork) -> FaceView | None:
     """Return the points of the face in a photograph; None if the network finds no face there."""
-    camera, region, faces = look.camera, look.region, fit.rig.faces.numpy()
+    camera, region, faces = photo.camera, photo.region, fit.rig.faces.numpy()
     seen, probability = network(region.crop(image, SIZE))
     if probability < FOUND:
         return None
     rest_m = fit.rig.vertices_m.double()
-    skinning = vertex_skinning(fit.rig, *fit.pose(look.frame)).double()
+    skinning = vertex_skinning(fit.rig, *fit.pose(photo.frame)).double()
     turn = skinning[..., :3]
     vertices_m = ((turn @ rest_m[..., None])[..., 0] + skinning[..., 3]).numpy()
     mesh = mesh_on_cpu(vertices_m, faces)
-    rendered, _ = network(_rendered(mesh, normals_of(vertices_m, faces), faces, look))
+    rendered, _ = network(_rendered(mesh, normals_of(vertices_m, faces), faces, photo))
     hits = cast(mesh, *camera.rays(region.to_image(rendered, SIZE)))
     met = np.full((POINTS, 15), np.nan)  # at the points: position at rest, position, turn from rest
     met[hits.face >= 0] = hits.interpolate(np.hstack([rest_m.numpy(), vertices_m, turn.flatten(1).numpy()]), faces)
@@ -174,12 +174,12 @@ def _view(image: np.ndarray, look: Look, fit: BodyFit, network: FaceNetwork) -> 
     return FaceView(camera.name, met[:, :3], seen_m, np.nan_to_num(by_rest))
 
 
-def _rendered(mesh: wp.Mesh, normals: np.ndarray, faces: np.ndarray, look: Look) -> np.ndarray:
+def _rendered(mesh: wp.Mesh, normals: np.ndarray, faces: np.ndarray, photo: Photograph) -> np.ndarray:
     """Render a body with vertex normals (V, 3) in grey on white, as sharp as the photograph, (SIZE, SIZE, 3) uint8."""
-    size = min(SIZE, round(look.region.side_px))
+    size = min(SIZE, round(photo.region.side_px))
     places = np.stack(np.meshgrid(*2 * [np.arange(size) + 0.5]), -1).reshape(-1, 2)
-    hits = cast(mesh, *look.camera.rays(look.region.to_image(places, size)))
-    lit = (hits.interpolate(normals, faces) @ look.camera.R.T @ LIGHT).clip(0, 1)
+    hits = cast(mesh, *photo.camera.rays(photo.region.to_image(places, size)))
+    lit = (hits.interpolate(normals, faces) @ photo.camera.R.T @ LIGHT).clip(0, 1)
     picture = np.full(size**2, 255, np.uint8)
     picture[hits.face >= 0] = 105 + 105 * lit
     enlarged = cv2.resize(picture.reshape(size, size), (SIZE, SIZE), interpolation=cv2.INTER_LINEAR)

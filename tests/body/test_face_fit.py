@@ -17,8 +17,8 @@ from hnerf.body.face_fit import (
     changes,
     face_axes,
     fit_face,
-    looks_at_face,
     moved_face,
+    photographs_of_face,
 )
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
@@ -97,14 +97,17 @@ def test_only_photographs_of_the_whole_face_are_looked_at(tmp_path: Path) -> Non
     body = moving_body((0, 1))
     cameras = {str(k): ring_camera(str(k), -0.97 + k * np.pi / 2) for k in range(4)}
     capture = record(tmp_path, body, cameras, ("0", "1", "2", "3"))
-    assert [(look.camera.name, look.frame) for look in looks_at_face(capture, body)] == [("0", 0), ("0", 1)]
+    assert [(photo.camera.name, photo.frame) for photo in photographs_of_face(capture, body)] == [
+        ("0", 0),
+        ("0", 1),
+    ]
     small = {name: camera.scaled(0.2) for name, camera in cameras.items()}
-    assert looks_at_face(dataclasses.replace(capture, cameras=small), body) == []
+    assert photographs_of_face(dataclasses.replace(capture, cameras=small), body) == []
     cut = {
         name: dataclasses.replace(camera, K=camera.K - [[0, 0, 0], [0, 0, 90], [0, 0, 0]])
         for name, camera in cameras.items()
     }
-    assert looks_at_face(dataclasses.replace(capture, cameras=cut), body) == []
+    assert photographs_of_face(dataclasses.replace(capture, cameras=cut), body) == []
 
 
 def test_a_face_that_was_moved_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +134,7 @@ def test_too_few_views_or_cameras_change_nothing(tmp_path: Path, monkeypatch: py
     """Two photographs show the face; a single camera is not even looked at."""
     monkeypatch.setattr(face_fit, "FaceNetwork", lambda: None)
     monkeypatch.setattr(Capture, "image", lambda self, name, frame: None)
-    monkeypatch.setattr(face_fit, "_view", lambda image, look, fit, network: face_view(look.camera.name, 0.01, 0))
+    monkeypatch.setattr(face_fit, "_view", lambda image, photo, fit, network: face_view(photo.camera.name, 0.01, 0))
     body = moving_body((0, 1))
     cameras = {str(k): ring_camera(str(k), -0.97 + k * np.pi / 2) for k in range(4)}
     assert fit_face(record(tmp_path, body, cameras, ("0", "1", "2", "3")), body) is body
