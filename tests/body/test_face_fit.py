@@ -14,6 +14,7 @@ from hnerf.body.face_fit import (
     LIGHT,
     POINT_STD_M,
     FaceView,
+    _view,
     changes,
     face_axes,
     fit_face,
@@ -21,8 +22,9 @@ from hnerf.body.face_fit import (
     photographs_of_face,
 )
 from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import vertex_skinning
 from hnerf.capture.capture import Capture
-from hnerf.detection.faces import POINTS
+from hnerf.detection.faces import POINTS, SIZE
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.rays import cast, mesh_on_cpu
 from hnerf.models import FACE_LANDMARKS, has_model
@@ -108,6 +110,30 @@ def test_only_photographs_of_the_whole_face_are_looked_at(tmp_path: Path) -> Non
         for name, camera in cameras.items()
     }
     assert photographs_of_face(dataclasses.replace(capture, cameras=cut), body) == []
+
+
+def test_a_view_compares_photograph_and_body(tmp_path: Path) -> None:
+    """The network finds all points 2 crop pixels farther right in the photograph, which is black. In a region of 0.3 m,
+    these are 0.3 x 2 / 192 m along its upper side. Derivatives are those of pixels, by differences, at the nearest
+    vertices."""
+    body = moving_body((0, 1))
+    capture = record(tmp_path, body, {"0": ring_camera("0", -0.97)}, ("0",))
+    photo = photographs_of_face(capture, body)[1]
+    grid = np.stack(np.meshgrid(np.linspace(76, 116, 18), np.linspace(76, 116, 26)), -1).reshape(-1, 2)
+    black = np.zeros((256, 256, 3), np.uint8)
+    view = _view(black, photo, body, lambda crop: (grid + (0 if crop.any() else (2, 0)), 1.0))  # type: ignore[arg-type]
+    assert view is not None and not np.isnan(view.rest_m).any()
+    right = np.array([np.cos(photo.region.angle), np.sin(photo.region.angle)])
+    np.testing.assert_allclose(view.seen_m, np.tile(0.3 * 2 / SIZE * right, (POINTS, 1)))
+    transforms = vertex_skinning(body.rig, *body.pose(1)).double()
+    for k in (0, 200, 467):
+        rest_m = view.rest_m[k]
+        nearest = int((body.rig.vertices_m - torch.from_numpy(rest_m)).norm(dim=-1).argmin())
+        turn, shift = transforms[nearest, :, :3].numpy(), transforms[nearest, :, 3].numpy()
+        ends_px = [photo.camera.project((rest_m + step) @ turn.T + shift)[0] for step in 1e-4 * np.eye(3)]
+        by_rest = (np.array(ends_px) - photo.camera.project(rest_m @ turn.T + shift)[0]).T / 1e-4
+        np.testing.assert_allclose(view.by_rest[k], by_rest * 0.3 / photo.region.side_px, atol=0.02)
+    assert _view(black, photo, body, lambda crop: (grid, 0.5)) is None  # type: ignore[arg-type]
 
 
 def test_a_face_that_was_moved_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,8 +5,10 @@ from pathlib import Path
 import pytest
 
 from hnerf.config import FitSettings
+from hnerf.models import FACE_LANDMARKS
 from hnerf.results import FitReport
 from tasks import fit as module
+from tasks import stage
 from tasks.store import Artifact, Store
 
 
@@ -17,15 +19,44 @@ class Body:
         (out / "body.npz").write_bytes(b"body")
 
 
+class Face(Body):
+    """A fake body whose face was fitted."""
+
+    def save(self, out: Path) -> None:
+        (out / "face.npz").write_bytes(b"face")
+
+
+def report(seconds: float = 1.0) -> FitReport:
+    empty: dict[str, list[float]] = {"keypoint_residual_px": [], "silhouette_iou": [], "keypoint_offsets_m": []}
+    return FitReport(seconds={"start": seconds}, frames=[], poor_frames=[], stature_m=1.8, beta={}, **empty)
+
+
 def test_the_digest_of_a_fit_does_not_depend_on_its_duration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: None)
     given = Artifact(stage="capture", root=tmp_path, files={})
 
     def made(store: str, seconds: float) -> Artifact:
-        empty: dict[str, list[float]] = {"keypoint_residual_px": [], "silhouette_iou": [], "keypoint_offsets_m": []}
-        report = FitReport(seconds={"start": seconds}, frames=[], poor_frames=[], stature_m=1.8, beta={}, **empty)
-        monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report))
+        monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report(seconds)))
         return module.fit(Store(tmp_path / store), given, given, None, FitSettings())
 
     quick, slow = made("a", 1.0), made("b", 2.0)
     assert quick.digest == slow.digest and slow.metrics == {"start": 2.0}
+
+
+@pytest.mark.parametrize(("installed", "masked"), [(True, True), (False, True), (True, False)])
+def test_a_face_is_fitted_with_masks_and_the_network(
+    installed: bool, masked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fake face is saved as another file than the body. The artifact's key depends on the network, so it is not
+    found in the store of the fit without."""
+    given = Artifact(stage="capture", root=tmp_path, files={})
+    monkeypatch.setattr(module, "calibrated_capture", lambda *_: None)
+    monkeypatch.setattr(module.Masks, "load", lambda _: "masks")
+    monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report()))
+    monkeypatch.setattr(module, "fit_face", lambda _, body: Face())
+    store = Store(tmp_path / "store")
+    for there in (not installed, installed):
+        for where in (module, stage):
+            monkeypatch.setattr(where, "has_model", lambda name, there=there: there and name == FACE_LANDMARKS)
+        fitted = module.fit(store, given, given, given if masked else None, FitSettings())
+    assert (fitted.root / "face.npz").exists() == (installed and masked)
