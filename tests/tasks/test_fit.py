@@ -49,7 +49,7 @@ def test_a_face_is_fitted_with_masks_and_the_network(
 ) -> None:
     """The fake face is saved as another file than the body. The artifact's key depends on the network, so it is not
     found in the store of the fit without."""
-    given = Artifact(stage="capture", root=tmp_path, files={})
+    given = Artifact(stage="capture", root=tmp_path / ("0" * 32), files={})
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: None)
     monkeypatch.setattr(module.Masks, "load", lambda _: "masks")
     monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report()))
