@@ -65,13 +65,7 @@ class FaceView:
 
 def fit_face(capture: Capture, fit: BodyFit) -> BodyFit:
     """Return the fit with the face of its rest body moved to where photographs of the training frames show it; the same
-    fit if fewer than LEAST_VIEWS show it.
-
-    One camera does not tell a head that is turned from one that is wider, so its fit is returned unchanged, too. Raises
-    InputError if the network is missing.
-    """
-    if len(capture.train_cameras) == 1:
-        return fit
+    fit if fewer than LEAST_VIEWS show it. Raises InputError if the network is missing."""
     network, photographs = FaceNetwork(), evenly_spaced(photographs_of_face(capture, fit), MOST_VIEWS)
 
     def view(photo: Photograph) -> FaceView | None:
