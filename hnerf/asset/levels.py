@@ -1,7 +1,7 @@
 """Levels of detail: the asset's mesh with fewer faces, on the same texture and with the same skin."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,10 @@ import trimesh
 from hnerf.asset.simplify import collapse_edges
 from hnerf.asset.texture import UvLayout
 
+FACE_WEIGHT = 10.0  # of errors at vertices that an expression moves by more than MOVED_M: people look at faces
+MOVED_M = 0.002
 FACES_PER_SEAM_EDGE = 1.5  # at least: with fewer faces, charts break, since their seams are kept
+NUMBER = "number"  # of a vertex before decimation
 
 log = logging.getLogger("hnerf.asset")
 
@@ -26,10 +29,19 @@ class Level:
     layout: UvLayout
 
 
-def levels_of(points_m: np.ndarray, faces: np.ndarray, layout: UvLayout, face_counts: Sequence[int]) -> list[Level]:
+def levels_of(
+    points_m: np.ndarray,
+    faces: np.ndarray,
+    layout: UvLayout,
+    face_counts: Sequence[int],
+    expressions_m: Mapping[str, np.ndarray],
+) -> list[Level]:
     """Return a mesh (V, 3), (F, 3) and its decimations to each count of triangles, largest first. Counts that the mesh
     does not exceed are left out. So are, with a warning, counts so small that hardly any faces would be left between
-    the charts' seams."""
+    the charts' seams. expressions_m (V, 3), by name: what they move is decimated least."""
+    moves = np.zeros(len(points_m), bool)
+    for moved_m in expressions_m.values():
+        moves |= np.linalg.norm(moved_m, axis=1) > MOVED_M
     whole, seams = Level(np.arange(len(points_m)), faces, layout), len(seam_edges(layout.face_uvs))
     found = [whole]
     for count in sorted({count for count in face_counts if count < len(faces)}, reverse=True):
@@ -38,7 +50,7 @@ def levels_of(points_m: np.ndarray, faces: np.ndarray, layout: UvLayout, face_co
                 "level of detail of %d triangles left out: the texture's seams alone have %d edges", count, seams
             )
         else:
-            found.append(_decimated(points_m, whole, count))
+            found.append(_decimated(points_m, whole, count, moves))
     return found
 
 
@@ -48,19 +60,22 @@ def seam_edges(face_uvs: np.ndarray) -> np.ndarray:
     return edges[trimesh.grouping.group_rows(edges, require_count=1)]
 
 
-def _decimated(points_m: np.ndarray, whole: Level, face_count: int) -> Level:
-    """Return the mesh decimated by collapsing edges to one of their ends. The charts' seams are kept: the mesh is cut
-    open along them, and its parts still fit together afterwards."""
+def _decimated(points_m: np.ndarray, whole: Level, face_count: int, moves: np.ndarray) -> Level:
+    """Return the mesh decimated by collapsing edges to one of their ends, least at the vertices that move (V,). The
+    charts' seams are kept: the mesh is cut open along them, and its parts still fit together afterwards."""
     uvs, face_uvs = np.unique(whole.layout.face_uvs, return_inverse=True)
     face_uvs = face_uvs.reshape(-1, 3)
     vertex_of_uv = np.zeros(len(uvs), np.int64)
     vertex_of_uv[face_uvs] = whole.faces
+    weights = np.where(moves, FACE_WEIGHT, 1.0)[vertex_of_uv]
+    cut = pymeshlab.Mesh(points_m[vertex_of_uv], face_uvs, v_scalar_array=weights)
+    cut.add_vertex_custom_scalar_attribute(np.arange(len(uvs), dtype=np.float64), NUMBER)
     meshes = pymeshlab.MeshSet()
-    numbered = np.arange(len(uvs), dtype=np.float64)
-    meshes.add_mesh(pymeshlab.Mesh(points_m[vertex_of_uv], face_uvs, v_scalar_array=numbered))
-    collapse_edges(meshes, face_count, onto_ends=True)
+    meshes.add_mesh(cut)
+    collapse_edges(meshes, face_count, onto_ends=True, weighted=len(np.unique(weights)) > 1)
     meshes.meshing_remove_unreferenced_vertices()
     mesh = meshes.current_mesh()
-    kept, corners = mesh.vertex_scalar_array().astype(np.int64), mesh.face_matrix().astype(np.int64)
+    kept = mesh.vertex_custom_scalar_attribute_array(NUMBER).astype(np.int64)
+    corners = mesh.face_matrix().astype(np.int64)
     vertices, faces = np.unique(vertex_of_uv[kept][corners], return_inverse=True)
     return Level(vertices, faces.reshape(-1, 3), UvLayout(whole.layout.uvs[uvs[kept]], corners))

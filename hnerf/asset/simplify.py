@@ -17,16 +17,17 @@ def simplify(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertex_matrix(), mesh.face_matrix(), process=False)
 
 
-def collapse_edges(meshes: pymeshlab.MeshSet, faces: int, onto_ends: bool) -> None:
+def collapse_edges(meshes: pymeshlab.MeshSet, faces: int, onto_ends: bool, weighted: bool = False) -> None:
     """Collapse edges of the current mesh until it has at most `faces` triangles (quadrics, Garland and Heckbert 1997).
     Edges collapse to their best point or, with onto_ends, to one of their ends. The latter keeps every edge of an open
-    mesh's boundary."""
+    mesh's boundary. weighted: whether the vertices' scalars, which must differ, are weights of the errors there."""
     meshes.meshing_decimation_quadric_edge_collapse(  # arguments that are not given keep the values of the last call
         targetfacenum=faces,
         preservetopology=True,
         preservenormal=True,
         preserveboundary=onto_ends,
         optimalplacement=not onto_ends,
+        qualityweight=weighted,
         autoclean=not onto_ends,  # it merges vertices at the same place, as on both sides of a cut
     )
 

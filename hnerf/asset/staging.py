@@ -143,7 +143,7 @@ def stage_avatar(
     rigs = stage_rigs(rig, joints_m - stands_m, rest, motions, floor_m, bones)
     return StagedAvatar(
         rest_points_m=rest.points_m,
-        levels=levels_of(rest.points_m, rig.faces.numpy(), layout, level_faces),
+        levels=levels_of(rest.points_m, rig.faces.numpy(), layout, level_faces, expressions_m or {}),
         shapes_m=rest.shapes_m,
         expressions_m=_turned(expressions_m, body),
         physiques_m=_turned(physiques_m, body),

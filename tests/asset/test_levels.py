@@ -17,7 +17,7 @@ def test_a_cube_is_simplified_to_its_corners() -> None:
     cube = trimesh.creation.box((2, 2, 2)).subdivide()
     unused = np.zeros((1, 2), np.float32)
     layout = UvLayout(np.concatenate([unused, cube.vertices[:, :2].astype(np.float32)]), 1 + np.array(cube.faces))
-    levels = levels_of(cube.vertices, cube.faces, layout, [12, 48, 16])
+    levels = levels_of(cube.vertices, cube.faces, layout, [12, 48, 16], {})
     assert [len(level.faces) for level in levels] == [48, 16, 12]
     np.testing.assert_array_equal(levels[0].vertices, range(26))
     corners = levels[2]
@@ -43,7 +43,7 @@ def test_levels_of_detail_keep_all_seams_of_the_charts(caplog: pytest.LogCapture
     """A closed column whose charts have seams with 224 edges in all, so no level can have fewer than 336 faces."""
     column = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(column.vertices, column.faces, 64)
-    whole, coarse = levels_of(column.vertices, column.faces, layout, [5000, 400, 335])
+    whole, coarse = levels_of(column.vertices, column.faces, layout, [5000, 400, 335], {})
     assert (len(whole.faces), len(coarse.faces)) == (816, 400)
     mesh = trimesh.Trimesh(column.vertices[coarse.vertices], coarse.faces, process=False)
     assert mesh.is_watertight
@@ -69,3 +69,20 @@ def test_the_distance_of_a_level_is_averaged_over_points_of_both_meshes(staged: 
     assert (figures["lod1"]["vertices"], figures["lod1"]["triangles"]) == (4, 2)
     assert figures["lod1"]["to_lod0_mean_mm"] == pytest.approx(250 / np.sqrt(2) + 250, rel=0.02)
     assert figures["lod1"]["to_lod0_p99_mm"] == pytest.approx(980, rel=0.01)  # 2 % of the slopes lie above 0.98 m
+
+
+def test_faces_that_expressions_move_are_decimated_least() -> None:
+    """A ball in 1280 triangles, in one chart. An expression moves one half of it by 3 mm and the other by 1 mm: the
+    first keeps more than twice as many vertices. If an expression moves all vertices, they are decimated alike."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    right = ball.vertices[:, 0] > 0
+    layout = UvLayout(ball.vertices[:, :2].astype(np.float32), np.array(ball.faces))
+    moved_m = np.where(right, 0.003, 0.001)[:, None] * [0.0, 0, 1]
+
+    def kept(expressions_m: dict[str, np.ndarray]) -> tuple[int, int]:
+        level = levels_of(ball.vertices, ball.faces, layout, [300], expressions_m)[1]
+        return right[level.vertices].sum(), (~right)[level.vertices].sum()
+
+    here, there = kept({"smile": moved_m})
+    assert here > 2 * there
+    assert kept({"smile": moved_m + 0.01}) == kept({})
