@@ -17,11 +17,11 @@ Primary = Literal["novel_view", "novel_pose"]  # these splits are meshed and sco
 
 
 class FitReport(TypedDict):
-    """report.json of the body fit; lists have one value per frame. seconds: duration of each part, not written to the
-    file. silhouette_iou: IoU of the body's silhouette with the masks, null without masks. beta: shape values by name.
-    keypoint_offsets_m (25, 3): offset between where the detector and the body model place each keypoint. given_poses:
-    how poses that came with the recording were used. on_ground: with one camera, whether world height 0 was taken as
-    the ground."""
+    """report.json of the body fit, before its face was moved; lists have one value per frame. seconds: duration of each
+    part, not written to the file. silhouette_iou: IoU of the body's silhouette with the masks, null without masks.
+    beta: shape values by name. keypoint_offsets_m (25, 3): offset between where the detector and the body model place
+    each keypoint. given_poses: how poses that came with the recording were used. on_ground: with one camera, whether
+    world height 0 was taken as the ground."""
 
     seconds: NotRequired[dict[str, float]]
     frames: list[int]

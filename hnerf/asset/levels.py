@@ -11,8 +11,7 @@ import trimesh
 from hnerf.asset.simplify import collapse_edges
 from hnerf.asset.texture import UvLayout
 
-FACE_WEIGHT = 10.0  # of errors at vertices that an expression moves by more than MOVED_M: people look at faces
-MOVED_M = 0.002
+MOVED_M = 0.002  # vertices that an expression moves farther are decimated least: people look at them
 FACES_PER_SEAM_EDGE = 1.5  # at least: with fewer faces, charts break, since their seams are kept
 NUMBER = "number"  # of a vertex before decimation
 
@@ -67,12 +66,11 @@ def _decimated(points_m: np.ndarray, whole: Level, face_count: int, moves: np.nd
     face_uvs = face_uvs.reshape(-1, 3)
     vertex_of_uv = np.zeros(len(uvs), np.int64)
     vertex_of_uv[face_uvs] = whole.faces
-    weights = np.where(moves, FACE_WEIGHT, 1.0)[vertex_of_uv]
-    cut = pymeshlab.Mesh(points_m[vertex_of_uv], face_uvs, v_scalar_array=weights)
+    cut = pymeshlab.Mesh(points_m[vertex_of_uv], face_uvs, v_scalar_array=moves[vertex_of_uv].astype(np.float64))
     cut.add_vertex_custom_scalar_attribute(np.arange(len(uvs), dtype=np.float64), NUMBER)
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(cut)
-    collapse_edges(meshes, face_count, onto_ends=True, weighted=len(np.unique(weights)) > 1)
+    collapse_edges(meshes, face_count, onto_ends=True, weighted=len(np.unique(moves)) > 1)
     meshes.meshing_remove_unreferenced_vertices()
     mesh = meshes.current_mesh()
     kept = mesh.vertex_custom_scalar_attribute_array(NUMBER).astype(np.int64)

@@ -20,7 +20,9 @@ def simplify(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 def collapse_edges(meshes: pymeshlab.MeshSet, faces: int, onto_ends: bool, weighted: bool = False) -> None:
     """Collapse edges of the current mesh until it has at most `faces` triangles (quadrics, Garland and Heckbert 1997).
     Edges collapse to their best point or, with onto_ends, to one of their ends. The latter keeps every edge of an open
-    mesh's boundary. weighted: whether the vertices' scalars, which must differ, are weights of the errors there."""
+    mesh's boundary. weighted: errors count more where the vertices' scalars are larger. MeshLab maps their range to its
+    own, so they must differ.
+    """
     meshes.meshing_decimation_quadric_edge_collapse(  # arguments that are not given keep the values of the last call
         targetfacenum=faces,
         preservetopology=True,

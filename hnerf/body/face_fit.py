@@ -1,6 +1,6 @@
 """The face: the rest body's features, moved to where a network sees them in photographs.
 
-The network also looks at the fitted body, rendered into the same places: what it gets wrong in both cancels.
+The network also looks at the fitted body, rendered from the same cameras: errors that are alike in both cancel.
 """
 
 import dataclasses
@@ -29,13 +29,14 @@ log = logging.getLogger("hnerf.fit")
 
 RIGHT_EYE, LEFT_EYE, EARS = 15, 16, [17, 18]  # of BODY_25
 TOWARDS_EARS, BELOW_M, SIDE_M = 0.3, 0.035, 0.3  # a head's region: its middle from the eyes, and its side
-MOST_VIEWS = 24
+MOST_VIEWS = 24  # photographs looked at, evenly spaced
 FACING = 0.5  # least cosine between where the face looks and the direction to the camera
 LEAST_SIDE_PX = 24  # of a region: with fewer pixels, no face can be found
 FOUND = 0.9  # least probability of a face in a photograph
-LEAST_VIEWS = 3
+LEAST_VIEWS = 3  # photographs with a face; with fewer, the face stays as it is
 LIGHT = np.array([0, -0.6, -0.8])  # direction towards the light in camera axes: from above, behind the camera
-# Standard deviation of a point's difference, alike in all photographs of a camera; and where it counts as an outlier.
+# Standard deviation of a point in the mean of a camera's photographs, whose errors are alike; and the difference from
+# which a point hardly counts.
 POINT_STD_M, OUTLIER_M = 0.002, 0.02
 CHANGE_STD_M = np.array([0.01, 0.001, 0.01])  # a priori, to the left, ahead and up: views from the front hide depth
 SOLVES = 5  # each with the weights that the one before leaves
@@ -65,7 +66,7 @@ class FaceView:
 
 def fit_face(capture: Capture, fit: BodyFit) -> BodyFit:
     """Return the fit with the face of its rest body moved to where photographs of the training frames show it; the same
-    fit if fewer than LEAST_VIEWS show it. Raises InputError if the network is missing."""
+    fit if fewer than LEAST_VIEWS show it. Raises InputError if the network or an image is missing."""
     network, photographs = FaceNetwork(), evenly_spaced(photographs_of_face(capture, fit), MOST_VIEWS)
 
     def view(photo: Photograph) -> FaceView | None:
@@ -80,8 +81,8 @@ def fit_face(capture: Capture, fit: BodyFit) -> BodyFit:
 
 
 def photographs_of_face(capture: Capture, fit: BodyFit) -> list[Photograph]:
-    """Return the photographs, of training cameras and frames, in which the body looks towards the camera and the whole
-    head is in the image."""
+    """Return the photographs, by training camera, then frame, in which the body looks towards the camera and the whole
+    head is in the image, in a region of LEAST_SIDE_PX or more."""
     photographs = []
     for frame in capture.train_frames:
         vertices_m = pose_vertices(fit.rig, *fit.pose(frame))
@@ -92,9 +93,10 @@ def photographs_of_face(capture: Capture, fit: BodyFit) -> list[Photograph]:
             side_px = SIDE_M * camera.K[0, 0] / depth_m
             region = Region(pixels[0], side_px, upright_angle(pixels[1] - pixels[0]))
             corners_px = region.to_image(np.array([[0, 0], [0, 1], [1, 0], [1, 1]]), 1)
-            if towards @ ahead > FACING * np.linalg.norm(towards) and camera.holds(corners_px).all():
-                photographs += [Photograph(camera, frame, region)] if side_px >= LEAST_SIDE_PX else []
-    return photographs
+            large = side_px >= LEAST_SIDE_PX  # negative if the head is behind the camera
+            if large and towards @ ahead > FACING * np.linalg.norm(towards) and camera.holds(corners_px).all():
+                photographs.append(Photograph(camera, frame, region))
+    return sorted(photographs, key=lambda photo: photo.camera.name)
 
 
 def face_axes(keypoints_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -115,13 +117,14 @@ def rest_axes(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def changes(views: list[FaceView], axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rest positions of the points (K, 3) that any view has, and how they must change (K, 3): robust least
-    squares, in which all views of a camera together count as one. axes (3, 3): of the face at rest."""
-    missed = np.isnan([view.rest_m[:, 0] for view in views])
-    some = ~missed.all(0)
+    """Return the rest positions of the points (K, 3) that any view has, medians over the views, and how they must
+    change (K, 3), metres: robust least squares, in which all views of a point by one camera together count as one. axes
+    (3, 3): of the face at rest."""
+    has = ~np.isnan([view.rest_m[:, 0] for view in views])
+    some = has.any(0)
     seen_m, by_rest = (np.array([getattr(view, name)[some] for view in views]) for name in ("seen_m", "by_rest"))
-    names = [view.camera for view in views]
-    trust = ~missed[:, some] / (POINT_STD_M**2 * np.array([[names.count(name)] for name in names]))
+    names, has = np.array([view.camera for view in views]), has[:, some].astype(float)
+    trust = has / (POINT_STD_M**2 * np.maximum((names[:, None] == names) @ has, 1))
     prior, change_m = axes.T / CHANGE_STD_M**2 @ axes, np.zeros((some.sum(), 3))
     for _ in range(SOLVES):
         off_m = seen_m - np.einsum("vkic,kc->vki", by_rest, change_m)
@@ -161,6 +164,7 @@ def _view(image: np.ndarray, photo: Photograph, fit: BodyFit, network: FaceNetwo
     hits = cast(mesh, *camera.rays(region.to_image(rendered, SIZE)))
     met = np.full((POINTS, 15), np.nan)  # at the points: position at rest, position, turn from rest
     met[hits.face >= 0] = hits.interpolate(np.hstack([rest_m.numpy(), vertices_m, turn.flatten(1).numpy()]), faces)
+    met[np.linalg.norm(met[:, :3] - rest_axes(fit.rig)[0], axis=1) > SIDE_M / 2] = np.nan  # on a hand before the face
     metres = SIDE_M / region.side_px  # a pixel spans
     by_world = project(camera, torch.from_numpy(met[:, 3:6]))[1].numpy()
     by_rest = metres * by_world @ met[:, 6:].reshape(-1, 3, 3)

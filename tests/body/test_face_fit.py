@@ -11,7 +11,6 @@ from hnerf.body import face_fit
 from hnerf.body.descriptor import normals_of
 from hnerf.body.face_fit import (
     CHANGE_STD_M,
-    LIGHT,
     POINT_STD_M,
     FaceView,
     _view,
@@ -50,6 +49,14 @@ def test_depth_is_hardly_believed() -> None:
     against a prior of 1 mm ahead gives a fifth of 5 mm; against 1 cm, nearly all."""
     views = [face_view("a", 0.002, 0.003), face_view("b", 0.005, 0.003, side=1)]
     np.testing.assert_allclose(changes(views, AXES)[1], [[0.002, 0.003, 0.001]], rtol=0.1)
+
+
+def test_a_view_that_misses_a_point_does_not_take_trust_from_the_others() -> None:
+    """One of two views of a camera misses the point: the other has all of the camera's weight."""
+    views = [face_view("a", 0.004, 0), face_view("a", 0.5, 0)]
+    views[1].rest_m[:] = np.nan
+    prior = POINT_STD_M**2 / CHANGE_STD_M[0] ** 2
+    np.testing.assert_allclose(changes(views, AXES)[1][0, 0], 0.004 / (1 + prior), rtol=1e-2)
 
 
 def test_an_outlier_and_a_missed_point_have_no_influence() -> None:
@@ -103,6 +110,12 @@ def test_only_photographs_of_the_whole_face_are_looked_at(tmp_path: Path) -> Non
         ("0", 0),
         ("0", 1),
     ]
+    both = cameras | {"4": ring_camera("4", -1.1)}
+    seen = photographs_of_face(record(tmp_path, body, both, ("0", "4")), body)
+    assert [(photo.camera.name, photo.frame) for photo in seen] == [("0", 0), ("0", 1), ("4", 0), ("4", 1)]
+    behind = {"0": dataclasses.replace(cameras["0"], R=cameras["0"].R * [[-1], [1], [-1]])}
+    behind["0"] = dataclasses.replace(behind["0"], t_m=-behind["0"].R @ cameras["0"].centre_m)
+    assert photographs_of_face(dataclasses.replace(capture, cameras=cameras | behind), body) == []
     small = {name: camera.scaled(0.2) for name, camera in cameras.items()}
     assert photographs_of_face(dataclasses.replace(capture, cameras=small), body) == []
     cut = {
@@ -134,6 +147,9 @@ def test_a_view_compares_photograph_and_body(tmp_path: Path) -> None:
         by_rest = (np.array(ends_px) - photo.camera.project(rest_m @ turn.T + shift)[0]).T / 1e-4
         np.testing.assert_allclose(view.by_rest[k], by_rest * 0.3 / photo.region.side_px, atol=0.02)
     assert _view(black, photo, body, lambda crop: (grid, 0.5)) is None  # type: ignore[arg-type]
+    wide = _view(black, photo, body, lambda crop: (grid + np.array([0, 75]), 1.0))  # type: ignore[arg-type]
+    assert wide is not None  # the lowest points are on the shoulders, farther from the head's middle than its region
+    assert np.isnan(wide.rest_m[-1]).all() and not np.isnan(wide.rest_m[0]).any()
 
 
 def test_a_face_that_was_moved_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,10 +200,10 @@ def face_camera(body: BodyFit, name: str, angle: float) -> Camera:
 
 
 def photograph(body: BodyFit, camera: Camera, frame: int) -> np.ndarray:
-    """Render a body in grey on white, (H, W, 3) uint8."""
+    """Render a body in brown on grey, lit from above left, (H, W, 3) uint8."""
     vertices_m, faces = body.vertices_m()[body.index(frame)].double().numpy(), body.rig.faces.numpy()
     hits = cast(mesh_on_cpu(vertices_m, faces), *camera.rays(camera.pixels_px.reshape(-1, 2)))
-    lit = (hits.interpolate(normals_of(vertices_m, faces), faces) @ camera.R.T @ LIGHT).clip(0, 1)
-    picture = np.full((len(hits.face), 3), 255, np.uint8)
-    picture[hits.face >= 0] = (105 + 105 * lit)[:, None]
+    lit = (hits.interpolate(normals_of(vertices_m, faces), faces) @ camera.R.T @ [-0.4, -0.6, -0.7]).clip(0, 1)
+    picture = np.full((len(hits.face), 3), 127, np.uint8)
+    picture[hits.face >= 0] = (0.4 + 0.6 * lit)[:, None] * (200, 150, 120)
     return picture.reshape(camera.height_px, camera.width_px, 3)
