@@ -31,6 +31,8 @@ def fit(
     if masks and has_model(FACE_LANDMARKS):
         with timed("face", seconds, log):
             body = fit_face(capture, body)
+    elif masks:
+        log.info("face: stays the body model's: its network is not installed; run `hnerf models`")
     body.save(out)
     write_result(out / "report.json", FitReport, report)
     return seconds

@@ -73,8 +73,9 @@ def fit_face(capture: Capture, fit: BodyFit) -> BodyFit:
         return _view(capture.image(photo.camera.name, photo.frame), photo, fit, network)
 
     views = [found for found in side_by_side(view, photographs) if found]
-    log.info("face: found in %d of %d photographs", len(views), len(photographs))
-    if len(views) < LEAST_VIEWS:
+    few = len(views) < LEAST_VIEWS
+    log.info("face: found in %d of %d photographs%s", len(views), len(photographs), ": stays as it is" if few else "")
+    if few:
         return fit
     points_m, changes_m = changes(views, rest_axes(fit.rig)[1])
     return dataclasses.replace(fit, rig=moved_face(fit.rig, points_m, changes_m))

@@ -45,7 +45,11 @@ def test_the_digest_of_a_fit_does_not_depend_on_its_duration(tmp_path: Path, mon
 
 @pytest.mark.parametrize(("installed", "masked"), [(True, True), (False, True), (True, False)])
 def test_a_face_is_fitted_with_masks_and_the_network(
-    installed: bool, masked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    installed: bool,
+    masked: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The fake face is saved as another file than the body. The artifact's key depends on the network, so it is not
     found in the store of the fit without."""
@@ -55,8 +59,10 @@ def test_a_face_is_fitted_with_masks_and_the_network(
     monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report()))
     monkeypatch.setattr(module, "fit_face", lambda _, body: Face())
     store = Store(tmp_path / "store")
+    caplog.set_level("INFO")
     for there in (not installed, installed):
         for where in (module, stage):
             monkeypatch.setattr(where, "has_model", lambda name, there=there: there and name == FACE_LANDMARKS)
         fitted = module.fit(store, given, given, given if masked else None, FitSettings())
     assert (fitted.root / "face.npz").exists() == (installed and masked)
+    assert ("run `hnerf models`" in caplog.text) == masked
