@@ -77,7 +77,7 @@ def fit_face(capture: Capture, fit: BodyFit) -> BodyFit:
     log.info("face: found in %d of %d photographs%s", len(views), len(photographs), ": stays as it is" if few else "")
     if few:
         return fit
-    points_m, changes_m = changes(views, rest_axes(fit.rig)[1])
+    points_m, changes_m = solve_changes(views, rest_axes(fit.rig)[1])
     return dataclasses.replace(fit, rig=moved_face(fit.rig, points_m, changes_m))
 
 
@@ -117,7 +117,7 @@ def rest_axes(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     return face_axes((rig.keypoint_weights @ rig.vertices_m).double().numpy())
 
 
-def changes(views: list[FaceView], axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solve_changes(views: list[FaceView], axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rest positions of the points (K, 3) that any view has, medians over the views, and how they must
     change (K, 3), metres: robust least squares, in which all views of a point by one camera together count as one. axes
     (3, 3): of the face at rest."""

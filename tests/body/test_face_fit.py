@@ -14,11 +14,11 @@ from hnerf.body.face_fit import (
     POINT_STD_M,
     FaceView,
     _view,
-    changes,
     face_axes,
     fit_face,
     moved_face,
     photographs_of_face,
+    solve_changes,
 )
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import vertex_skinning
@@ -38,7 +38,7 @@ def test_views_of_a_camera_count_as_one() -> None:
     views of 2 mm each against 1 cm: 2 / (2 + 0.04). A change along z is seen by none."""
     seen_m = [0.004, 0.004, 0.004, 0.001]
     views = [face_view(camera, x_m, 0) for camera, x_m in zip("aaab", seen_m, strict=True)]
-    rest_m, change_m = changes(views, AXES)
+    rest_m, change_m = solve_changes(views, AXES)
     prior = POINT_STD_M**2 / CHANGE_STD_M[0] ** 2
     assert not rest_m.any() and rest_m.shape == (1, 3)
     np.testing.assert_allclose(change_m, [[0.0025 * 2 / (2 + prior), 0, 0]], rtol=0.02, atol=1e-12)
@@ -48,7 +48,7 @@ def test_depth_is_hardly_believed() -> None:
     """From the front a point has changed by (2, 3) mm, from the side by 5 mm ahead and again 3 mm up. A view of 2 mm
     against a prior of 1 mm ahead gives a fifth of 5 mm; against 1 cm, nearly all."""
     views = [face_view("a", 0.002, 0.003), face_view("b", 0.005, 0.003, side=1)]
-    np.testing.assert_allclose(changes(views, AXES)[1], [[0.002, 0.003, 0.001]], rtol=0.1)
+    np.testing.assert_allclose(solve_changes(views, AXES)[1], [[0.002, 0.003, 0.001]], rtol=0.1)
 
 
 def test_a_view_that_misses_a_point_does_not_take_trust_from_the_others() -> None:
@@ -56,20 +56,20 @@ def test_a_view_that_misses_a_point_does_not_take_trust_from_the_others() -> Non
     views = [face_view("a", 0.004, 0), face_view("a", 0.5, 0)]
     views[1].rest_m[:] = np.nan
     prior = POINT_STD_M**2 / CHANGE_STD_M[0] ** 2
-    np.testing.assert_allclose(changes(views, AXES)[1][0, 0], 0.004 / (1 + prior), rtol=1e-2)
+    np.testing.assert_allclose(solve_changes(views, AXES)[1][0, 0], 0.004 / (1 + prior), rtol=1e-2)
 
 
 def test_an_outlier_and_a_missed_point_have_no_influence() -> None:
     views = [face_view("a", 0.002, 0), face_view("b", 0.002, 0), face_view("c", 0.5, 0), face_view("d", 0.05, 0)]
     views[3].rest_m[:] = np.nan
-    np.testing.assert_allclose(changes(views, AXES)[1][0, 0], 0.002, rtol=0.03)
+    np.testing.assert_allclose(solve_changes(views, AXES)[1][0, 0], 0.002, rtol=0.03)
 
 
 def test_points_are_where_most_views_have_them() -> None:
     views = [face_view("a", 0, 0) for _ in range(3)]
     for view, x_m in zip(views, (0.1, 0.2, 0.9), strict=True):
         view.rest_m[0] = x_m
-    np.testing.assert_allclose(changes(views, AXES)[0], [[0.2, 0.2, 0.2]])
+    np.testing.assert_allclose(solve_changes(views, AXES)[0], [[0.2, 0.2, 0.2]])
 
 
 def test_the_face_of_a_standing_body_looks_along_minus_y() -> None:
