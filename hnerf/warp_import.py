@@ -5,3 +5,4 @@ import warp as wp
 __all__ = ["wp"]
 
 wp.config.log_level = wp.LOG_ERROR
+wp.config.enable_backward = False  # derivatives are kernels of their own; without these, kernels compile in half the time

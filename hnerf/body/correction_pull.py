@@ -59,7 +59,7 @@ def _kernels(dtype: torch.dtype) -> tuple[wp.Kernel, wp.Kernel]:
     scalar = wp.dtype_from_torch(dtype)
     Vector, Matrix = wp.types.vector(length=3, dtype=scalar), wp.types.matrix(shape=(3, 3), dtype=scalar)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(module="unique")
     def displace(
         twists: wp.array3d(dtype=Vector),
         bulge: wp.array(dtype=Vector),
@@ -86,7 +86,7 @@ def _kernels(dtype: torch.dtype) -> tuple[wp.Kernel, wp.Kernel]:
             shift += skin_weights[vertex, k] * carried[frame, skin_joints[vertex, k]]
         moved[i] = shift + wp.cross(turn, points[i])
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(module="unique")
     def differentiate(
         twists: wp.array3d(dtype=Vector),
         bulge: wp.array(dtype=Vector),

@@ -144,7 +144,7 @@ def _launch(centres: Tensor, radii: Tensor, cells: Tensor) -> None:
     wp.launch(_fill_balls, len(centres), inputs, device=wp.device_from_torch(cells.device))
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _fill_balls(centres: wp.array(dtype=wp.vec3i), radii: wp.array(dtype=float), cells: wp.array3d(dtype=wp.uint8)):
     """Set all cells with centres within `radii` of the centres' own to 1."""
     i = wp.tid()

@@ -134,7 +134,7 @@ def _kernels(channels: int) -> tuple[wp.Kernel, wp.Kernel]:
     level."""
     Node = wp.types.vector(length=channels, dtype=wp.float32)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(module="unique")
     def interpolate(
         points: wp.array(dtype=wp.vec3),
         sizes: wp.array(dtype=wp.vec3i),
@@ -162,7 +162,7 @@ def _kernels(channels: int) -> tuple[wp.Kernel, wp.Kernel]:
                         total += (share * u) * features[right]
             found[i, level] = total
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(module="unique")
     def differentiate(
         points: wp.array(dtype=wp.vec3),
         sizes: wp.array(dtype=wp.vec3i),
