@@ -11,18 +11,17 @@ import cv2
 import numpy as np
 
 from hnerf.capture.boxes import check_tables
-from hnerf.capture.edit_list import shown_frames
 from hnerf.capture.safe_io import check_image_size, read_image
 from hnerf.errors import InputError
 from hnerf.progress import report
 
 # Our own message, one line, replaces what OpenCV and FFmpeg would print about a bad video.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-# Only MP4 and QuickTime, whatever the file's name: other formats, such as playlists, make FFmpeg read further files.
-os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "format_whitelist;mov"
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
+# Only MP4 and QuickTime, whatever the file's name: other formats, such as playlists, make FFmpeg read further files.
+FORMATS = "format_whitelist;mov"
 PROGRESS_FRAMES = 100  # between two reports
 MIN_FPS, MAX_FPS = 0.01, 10_000.0  # of a recording
 
@@ -75,16 +74,13 @@ class Video:
         may be truncated)."""
         stream = _open_stream(path)
         check_image_size(path, stream.get(cv2.CAP_PROP_FRAME_WIDTH), stream.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        declared, times_s = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), list[float]()
-        while len(times_s) <= declared and stream.grab():
-            times_s.append(stream.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
-            if len(times_s) % PROGRESS_FRAMES == 0:
-                report(path.name, len(times_s), declared + 1)
-        report(path.name, 1, 1)
+        declared, times_s = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), _times_s(path, stream)
         count = len(times_s)
-        shown = declared if count == declared else shown_frames(path, declared)
-        if count == 0 or count != shown:
-            raise InputError(f"{path}: {shown} frames declared, {count} could be read; export it again whole, as H.264")
+        readable = len(_times_s(path, _open_stream(path, "ignore_editlist;1"))) if count < declared else count
+        if count == 0 or readable != declared:
+            raise InputError(
+                f"{path}: {declared} frames declared, {readable} could be read; export it again whole, as H.264"
+            )
         ascending = all(a < b for a, b in pairwise(times_s))
         declared_fps = stream.get(cv2.CAP_PROP_FPS)
         fps = declared_fps if MIN_FPS <= declared_fps <= MAX_FPS else None
@@ -106,10 +102,23 @@ class Video:
 Footage = ImageFolder | Video
 
 
-def _open_stream(path: Path) -> cv2.VideoCapture:
+def _times_s(path: Path, stream: cv2.VideoCapture) -> list[float]:
+    """Decode a video; return when each frame is shown, up to one frame more than the file declares."""
+    declared, times_s = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), list[float]()
+    while len(times_s) <= declared and stream.grab():
+        times_s.append(stream.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+        if len(times_s) % PROGRESS_FRAMES == 0:
+            report(path.name, len(times_s), declared + 1)
+    report(path.name, 1, 1)
+    return times_s
+
+
+def _open_stream(path: Path, *options: str) -> cv2.VideoCapture:
+    """Open a video. options: FFmpeg's, as `name;value`."""
     if not path.is_file():
         raise InputError(f"{path}: video missing; every calibrated camera needs one")
     check_tables(path)
+    os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "|".join([FORMATS, *options])
     # FFmpeg takes what precedes a colon in a relative path for a protocol.
     stream = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
     if not stream.isOpened():
