@@ -22,10 +22,12 @@ MaskOf = Callable[[int, Prior], np.ndarray]
 
 
 class Backend(NamedTuple):
-    """A source of masks for one camera. name: for the report."""
+    """A source of masks for one camera. name: for the report; by_prior: whether masks follow the prior where the
+    background is never seen."""
 
     name: str
     mask_of: MaskOf
+    by_prior: bool = False
 
 
 def choose_backend(
@@ -42,13 +44,14 @@ def choose_backend(
     if network is not None:
         return Backend("learned model", partial(_learned_mask, capture, camera, network))
     name = "median around the fitted body" if fitted else "median around the detected person"
-    if capture.background(camera) is not None:
+    by_prior = capture.background(camera) is None
+    if not by_prior:
         name = "clean plate"
     elif not fitted and not capture.has_person_masks:
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
-    return Backend(name, background_subtraction(capture, camera, prior_of, MEDIAN_FRAMES, settings))
+    return Backend(name, background_subtraction(capture, camera, prior_of, MEDIAN_FRAMES, settings), by_prior)
 
 
 def given_mask(capture: Capture, camera: str, frame: int, prior: Prior) -> np.ndarray:

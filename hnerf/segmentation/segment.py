@@ -11,6 +11,7 @@ import numpy as np
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
+from hnerf.capture.subject import subject_keypoints
 from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
 from hnerf.progress import tracked
@@ -28,16 +29,19 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
 
     A camera with given masks keeps them; the user's network comes next, then a clean plate. Otherwise the background is
     estimated from pixels out of reach of `body` or of the detected person. Of several people, only the subject is kept.
-    A mask that cannot be right is dropped and listed in the report. Raises InputError if no mask of a camera is left.
+    A mask that cannot be right, or that only the interpolated pose of an absent subject explains, is dropped and listed
+    in the report. Raises InputError if no mask of a camera is left.
     """
     priors = camera_priors(capture, body, settings)
     network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}
+    absent = _frames_without_subject(capture)
     for name, prior_of in tracked(priors, "segmentation", len(capture.train_cameras)):
         backend = choose_backend(capture, name, prior_of, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
-        masks = list(side_by_side(partial(_judged_mask, capture, backend, prior_of), range(len(capture.frames))))
+        judged = partial(_judged_mask, capture, backend, prior_of, absent)
+        masks = list(side_by_side(judged, range(len(capture.frames))))
         cameras[name] = {"backend": backend.name} | _findings(capture, name, masks)
         encoded |= {(name, frame): mask.encoded for frame, mask in zip(capture.frames, masks, strict=True)}
         for row in cameras[name]["dropped"]:
@@ -53,9 +57,26 @@ class _JudgedMask(NamedTuple):
     body_px: int
 
 
-def _judged_mask(capture: Capture, backend: Backend, prior_of: PriorOf, number: int) -> _JudgedMask:
-    prior = prior_of(number)
-    mask = backend.mask_of(capture.frames[number], prior)
+def _frames_without_subject(capture: Capture) -> frozenset[int]:
+    """Return the frames in which no training camera detects the subject, and for which no pose is given; none if the
+    recording has no keypoints."""
+    if not capture.has_keypoints:
+        return frozenset()
+    found = np.stack(list(subject_keypoints(capture).values()))
+    known = (found[..., 2] > 0).any((0, 2))
+    if poses := capture.given_poses():
+        known = known | poses.known
+    return frozenset(capture.frames[i] for i in np.flatnonzero(~known))
+
+
+def _judged_mask(
+    capture: Capture, backend: Backend, prior_of: PriorOf, absent: frozenset[int], number: int
+) -> _JudgedMask:
+    prior, frame = prior_of(number), capture.frames[number]
+    if backend.by_prior and frame in absent:  # the prior is only interpolated
+        nothing = np.zeros_like(prior.body)
+        return _JudgedMask(encode(nothing), MaskVerdict("nobody is detected in this frame", None, 0), 0)
+    mask = backend.mask_of(frame, prior)
     return _JudgedMask(encode(mask), judge_mask(mask, prior), int(prior.body.sum()))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.capture.masks import Masks, encode, movement_px
 from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
@@ -19,7 +19,8 @@ from hnerf.segmentation.difference import difference, exposure_corrected, masked
 from hnerf.segmentation.edge import refine_edge
 from hnerf.segmentation.prior import Prior
 from hnerf.segmentation.segment import segment
-from tests.segmentation.scene import only_frames, write_masks, write_scene
+from tests.calibration.synthetic import edited_keypoints
+from tests.segmentation.scene import only_frames, write_likely, write_masks, write_scene
 from tests.shared_data import shared_capture
 
 SETTINGS = SegmentationSettings()
@@ -263,6 +264,26 @@ def test_without_a_plate_the_background_is_found_around_the_body(tmp_path: Path)
     )
     masks = segment(capture, failed_fit, SETTINGS)  # type: ignore[arg-type]
     assert np.mean([iou(masks.get(*view), mask) for view, mask in truth.items()]) >= 0.95
+
+
+@pytest.mark.parametrize("absent", [(0, 1), (4,), (6, 7)], ids=["comes late", "is away for a while", "leaves early"])
+def test_without_a_plate_frames_in_which_nobody_is_detected_have_no_mask(
+    tmp_path: Path, absent: tuple[int, ...]
+) -> None:
+    capture, truth = write_scene(tmp_path, cameras=2, moves_m=0.1)
+    for camera, frame in product(capture.train_cameras, absent):
+        write_image(tmp_path / "images" / camera / f"{frame:06d}.png", read_rgb(tmp_path / f"background/{camera}.png"))
+        truth[camera, frame] = np.zeros_like(truth[camera, frame])
+    shutil.rmtree(tmp_path / "background")
+    write_likely(capture, truth)
+    with edited_keypoints(tmp_path) as found:
+        for keypoints in found.values():
+            keypoints[list(absent)] = 0
+    masks = segment(capture, None, SETTINGS)
+    for camera in capture.train_cameras:
+        dropped = masks.report["cameras"][camera]["dropped"]
+        assert dropped == [{"frame": frame, "reason": "nobody is detected in this frame"} for frame in absent]
+    assert sorted(masks.encoded) == sorted(view for view in truth if view[1] not in absent)
 
 
 def test_rendered_capture_against_ground_truth(wave: Capture, tmp_path: Path) -> None:
