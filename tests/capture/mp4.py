@@ -1,6 +1,9 @@
-"""Small videos with what phones write but OpenCV does not: a rotation, an uneven frame rate, edit lists."""
+"""Small videos with what phones and camcorders write but OpenCV does not: a rotation, an uneven frame rate, edit lists,
+interlaced pictures."""
 
+import base64
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +12,17 @@ import numpy as np
 
 QUARTER_TURN = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)  # clockwise, as the matrix in tkhd
 CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts")
+# A file with two interlaced pictures of 32 x 32 px that differ, encoded by x264.
+INTERLACED = zlib.decompress(
+    base64.b85decode(
+        "c-muNU{FXasVvAW&d+6FU}6B#Kx~v)mTZ_?U}DI?z`&7Kl$r{p!*f#-OMtX}YDbff`M3Sbn`3v1@XEcN^kh@hVatP8*XB=dyZ`^|bbBfB(8bQ1"
+        "=ky-_Yu&2+Ww(xY^5M`Br62{nzh*r3W{w~u9cL+5nqU5?z`(%Fo|~Uv1{BN5Ez3w@Kmp7zfJ6WTBLfH_03)g@biM-vUcdxIVI@V0*+6zoNjBI{"
+        "W-O)!VCW>qUIi#-U{Fa-DJcfhGO0PmB}h5~5PBKU<)&mNf^_7jp!?kjh*=mykAOM487VnMFqyK<lvHGuVL*PqM`B(|PAW(ZV`Xk;UK)@gQkDxg"
+        "6xo?7DG)iCl%mu$BuDX-7Ud{F*o>CNB}q9z_Rivx;uIt`D?w=jM^Jz~t-#;`q&;9Nczl5B6>>6@DvZobutkK#|NlTzAE?Ti(bqxr|3e0`bRhjn"
+        "bb}x$Mi@bak-UhO2O|Sp#_xtmod%$Cfr7;10;mH(SR|>W2pYO_cVGq=mw-ba=1?Xu0;&ai2w5D2Wq@MIXktuAa#g4)hrt;XSP-+4^O5u!0I_Xp"
+        "N(m@7O><MhGzcgn#~d)WixLY8a*#uTBNLcB01K0a$^"
+    )
+)
 
 
 def write_video(path: Path, levels: list[int], size_px: tuple[int, int] = (96, 64), fps: float = 25) -> None:

@@ -14,7 +14,7 @@ from tests.capture.mp4 import box, declare_samples, trim, write_video
 @pytest.fixture
 def video(tmp_path: Path) -> Path:
     """Return a video of three frames, which is readable as it is."""
-    write_video(tmp_path / "a.mp4", [90] * 3)
+    write_video(tmp_path / "a.mp4", [90, 100, 110])
     assert len(Video.open(tmp_path / "a.mp4").frames) == 3
     return tmp_path / "a.mp4"
 

@@ -181,7 +181,7 @@ def test_a_single_video_at_an_uneven_rate_gets_a_warning(tmp_path: Path, caplog:
 
 def test_a_rotation_in_the_metadata_is_honoured(tmp_path: Path) -> None:
     video = tmp_path / "a.mp4"
-    write_video(video, [200] * 3)
+    write_video(video, [200, 210, 220])
     rotate(video)
     upright = next(Video.open(video).read([0])).rgb
     assert upright.shape[:2] == (96, 64)
