@@ -211,6 +211,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_ablate(add(commands.ablate, capture, preset))
     _add_stability(add(commands.stability, capture))
     _add_render(add(commands.render))
+    _add_view(add(commands.view))
     _add_export(add(commands.export, preset))
     what = "List, check, clean up and transfer what the store holds."
     add_store_commands(subparsers.add_parser("store", help=what, description=what))
@@ -242,6 +243,15 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
     person.add_argument("--lens", type=path, metavar="FILE", help="intrinsics: intri.yml, or a TOML file")
     what = "field of view across the longer side (default: metadata, else estimated)"
     person.add_argument("--fov", type=number(float, 1, 170), metavar="DEG", help=what)
+
+
+def _add_view(view: argparse.ArgumentParser) -> None:
+    view.add_argument("subject", type=path, help=FOLDERS["subject"])
+    what = f"offer this motion, too: {MOTIONS}"
+    view.add_argument("--motion", type=path, action="append", default=[], metavar="FILE", help=what)
+    what = "address to serve at; 0.0.0.0 lets the whole network see the person (default: 127.0.0.1)"
+    view.add_argument("--host", default="127.0.0.1", help=what)
+    view.add_argument("--port", type=number(int, 1, 65535), default=8080, help="port to serve at (default: 8080)")
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:

@@ -251,6 +251,16 @@ def render(options: argparse.Namespace) -> None:
     print(f"{render_subject(options.subject, wanted, options.out)} pictures: {options.out}")
 
 
+def view(options: argparse.Namespace) -> None:
+    """Show a trained person in a browser, rendered live in any view, pose and shape; needs the extra `view`."""
+    from hnerf.render.page import view_subject
+    from tasks.store import require_intact
+
+    for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
+        require_intact(folder)
+    view_subject(options.subject, options.motion, options.host, options.port)
+
+
 def export(options: argparse.Namespace) -> None:
     """Export the asset of a trained person again, with other settings or more motions."""
     _check_section(options, "asset")

@@ -5,4 +5,5 @@ import warp as wp
 __all__ = ["wp"]
 
 wp.config.log_level = wp.LOG_ERROR
-wp.config.enable_backward = False  # derivatives are kernels of their own; without these, kernels compile in half the time
+# Derivatives are kernels of their own; without automatic ones, kernels compile in half the time.
+wp.config.enable_backward = False

@@ -65,10 +65,10 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
     See `write_pictures` for the files. Raises InputError if the options cannot be met.
     """
     with atomic_folder(out) as partial:
-        capture = _checked_capture(subject, options)
+        capture = checked_capture(subject, options)
         if options.motion or options.between or options.shape or options.volume is not None:
             require_poses(subject, "another motion or shape")
-        motion = _motion(subject, options, capture)
+        motion = chosen_motion(subject, options, capture)
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
         avatar = avatar_of(subject)
@@ -78,7 +78,7 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
     return len(shots)
 
 
-def _checked_capture(subject: Path, options: RenderOptions) -> Capture:
+def checked_capture(subject: Path, options: RenderOptions) -> Capture:
     """Return the subject's capture with its calibrated cameras; raise InputError if files are missing or options are
     invalid."""
     require_files(subject, ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors"))
@@ -94,7 +94,7 @@ def _checked_capture(subject: Path, options: RenderOptions) -> Capture:
     return recording_of(subject)
 
 
-def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
+def chosen_motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
     """Return the poses to show, on the body shape to show."""
     with readable(subject / "training"):
         own = BodyFit.load(subject / "training")
