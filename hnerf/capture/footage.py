@@ -13,6 +13,7 @@ import numpy as np
 
 from hnerf.capture.boxes import check_tables
 from hnerf.capture.safe_io import check_image_size, read_image
+from hnerf.capture.video_metadata import opencv_inverts
 from hnerf.errors import InputError
 from hnerf.progress import report
 
@@ -89,8 +90,9 @@ class Video:
         return Video(path, tuple(range(count)), fps, tuple(times_s) if ascending else ())
 
     def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
-        """Yield the wanted frames in ascending order. Raises InputError if one cannot be read."""
-        stream, position = _open_stream(self.path), 0
+        """Yield the wanted frames in ascending order, turned as the file states, but not mirrored. Raises InputError if
+        one cannot be read."""
+        stream, position, inverted = _open_stream(self.path), 0, opencv_inverts(self.path)
         for frame in sorted(wanted):
             while position < frame and stream.grab():
                 position += 1
@@ -98,7 +100,8 @@ class Video:
             if not ok:
                 raise InputError(f"{self.path}: frame {frame} cannot be read; export the video again as H.264")
             position += 1
-            yield VideoFrame(frame, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), None)
+            rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+            yield VideoFrame(frame, cv2.rotate(rgb, cv2.ROTATE_180) if inverted else rgb, None)
 
 
 Footage = ImageFolder | Video

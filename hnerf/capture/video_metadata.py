@@ -1,4 +1,5 @@
-"""Focal lengths in the metadata of images (EXIF) and of videos (boxes of MP4 and QuickTime)."""
+"""Focal lengths in the metadata of images (EXIF) and of videos (boxes of MP4 and QuickTime), and mirror images in the
+latter."""
 
 import struct
 from pathlib import Path
@@ -24,6 +25,20 @@ def focal_35mm(path: Path) -> float | None:
     except (Image.DecompressionBombError, OSError, OverflowError, SyntaxError, ValueError):  # reported when it is read
         return None
     return found if found and 1 <= found <= 2000 else None
+
+
+def opencv_inverts(path: Path) -> bool:
+    """Return whether OpenCV turns a video upside down: one to be shown mirrored, as front cameras may state, and not
+    also on its side. It reads such a matrix in `tkhd` as the nearest rotation, by 0 instead of 180 degrees or the other
+    way round."""
+    for kind, content in movie_boxes(path, MAX_METADATA_BYTES):
+        track = dict(boxes(content)) if kind == b"trak" else {}
+        handler = dict(boxes(track.get(b"mdia", b""))).get(b"hdlr", b"")
+        if handler[8:12] == b"vide" and (header := track.get(b"tkhd", b"")):
+            matrix = header[52:] if header[0] else header[40:]  # with 64 or 32-bit times
+            a, b, _, c, d = struct.unpack_from(">5i", matrix.ljust(20, bytes(1)))
+            return bool(a * d < b * c and abs(a) > abs(b))
+    return False
 
 
 def _of_image(path: Path) -> float | None:

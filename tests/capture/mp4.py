@@ -10,7 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-QUARTER_TURN = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)  # clockwise, as the matrix in tkhd
+# Matrices of tkhd: of the columns of its first two rows, the first two say where x and y of the picture go.
+QUARTER_TURN = (0, 1, -1, 0)  # clockwise
+LEFT_TO_RIGHT, TOP_TO_BOTTOM, TRANSPOSED = (-1, 0, 0, 1), (1, 0, 0, -1), (0, 1, 1, 0)  # mirrored
 CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts")
 # A file with two interlaced pictures of 32 x 32 px that differ, encoded by x264.
 INTERLACED = zlib.decompress(
@@ -36,9 +38,17 @@ def write_video(path: Path, levels: list[int], size_px: tuple[int, int] = (96, 6
     writer.release()
 
 
-def rotate(path: Path) -> None:
-    """Mark a video as to be shown turned by 90 degrees clockwise."""
-    _edit(path, b"tkhd", lambda content: content[:40] + QUARTER_TURN + content[76:])
+def show_as(path: Path, matrix: tuple[int, int, int, int], wide: bool = False) -> None:
+    """Mark a video as to be shown turned or mirrored. wide: whether to write 64-bit times."""
+    a, b, c, d = (part << 16 for part in matrix)
+    packed = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+
+    def shown(content: bytes) -> bytes:
+        version, created, modified, track, reserved, length = struct.unpack(">6I", content[:24])
+        numbers = version | wide << 24, created, modified, track, reserved, length
+        return struct.pack(">IQQIIQ" if wide else ">6I", *numbers) + content[24:40] + packed + content[76:]
+
+    _edit(path, b"tkhd", shown)
 
 
 def hold_frames(path: Path, first: int, rest: int) -> None:

@@ -1,4 +1,4 @@
-"""Synchronised footage: clocks, frame rates, uneven rates, rotation."""
+"""Synchronised footage: clocks, frame rates, uneven rates."""
 
 import errno
 import os
@@ -16,7 +16,7 @@ from hnerf.capture.ingest import ingest
 from hnerf.capture.uncalibrated import Uncalibrated
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
-from tests.capture.mp4 import hold_frames, rotate, write_video
+from tests.capture.mp4 import hold_frames, write_video
 from tests.capture.recordings import HEIGHT, WIDTH, write_easymocap
 
 
@@ -177,12 +177,3 @@ def test_a_single_video_at_an_uneven_rate_gets_a_warning(tmp_path: Path, caplog:
     hold_frames(tmp_path / "film" / "a.mp4", 10, 10)
     ingest(tmp_path / "film", CaptureSettings(), tmp_path / "uneven")
     assert "a.mp4: frames come up to 0.2 s off an even rate" in caplog.text
-
-
-def test_a_rotation_in_the_metadata_is_honoured(tmp_path: Path) -> None:
-    video = tmp_path / "a.mp4"
-    write_video(video, [200, 210, 220])
-    rotate(video)
-    upright = next(Video.open(video).read([0])).rgb
-    assert upright.shape[:2] == (96, 64)
-    assert upright[:40].mean() > 150 and upright[56:].mean() < 20  # the left half is now on top
