@@ -161,6 +161,7 @@ FAULTS = (
           "on_surface, weights = described,", "fields/fast_ray"),
     Fault("fast-core", "fields/fast", "torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])", "alpha_dot[:, -1:]"),
     Fault("fast-thickness", "fields/fast", " & (described.d <= self.outer_m[described.vertex])", ""),
+    Fault("fast-displaced-shell", "fields/fast", ".clamp(least_m, s.outer_m)", ""),
     Fault("fast-tighten-sides", "fields/fast", "side * described.d[seen]", "-side * described.d[seen]",
           "training/tighten"),
     Fault("fast-tighten-poses", "fields/fast", "seen |= described.near", "seen = described.near", "training/tighten"),

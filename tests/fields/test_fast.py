@@ -248,14 +248,14 @@ def test_samples_of_low_weight_do_not_darken_the_ray(monkeypatch: pytest.MonkeyP
 
 
 def test_the_shell_moves_with_the_displacement_of_a_frame():
-    """For a frame displaced by 2 cm, the shell is 2 cm higher. For one displaced by 6 cm, its upper end stops at the
-    setting of 7 cm, which is 5 cm higher."""
+    """For a frame displaced by 2 cm, the shell is 2 cm higher. For one displaced by 10 cm, its upper end stops at the
+    setting of 7 cm, which is 5 cm higher, and its lower end a cell of 1 cm inside the body, which is 6 cm higher."""
     settings = SETTINGS.model_copy(update={"nodes": 1, "shell_cell_m": 0.01, "inner_m": 0.1})
     field = FastField(RIG, settings, 2)
     assert field.deformation is not None
     field.outer_m.fill_(0.02)
     field.inner_m.fill_(0.07)
-    field.deformation.displacement.data[:2, 0, 2] = torch.tensor([0.02, 0.06])
+    field.deformation.displacement.data[:2, 0, 2] = torch.tensor([0.02, 0.1])
     bodies, _ = standing()
 
     def ends(moment: int) -> torch.Tensor:
