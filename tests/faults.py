@@ -95,6 +95,8 @@ FAULTS = (
     Fault("mask-swapped", "training/losses", "target.person * error", "(1 - target.person) * error"),
     Fault("mask-box", "training/losses", "pixel_colour(samples.in_box * samples.alpha, samples)",
           "pixel_colour(samples.alpha, samples)"),
+    Fault("mask-weight", "training/losses", "(target.weight * target.person * error)", "(target.person * error)"),
+    Fault("blend-weight", "training/losses", "(target.weight * (target.person + eta", "((target.person + eta"),
     Fault("blend-eta", "training/losses", "eta * (1 - target.person)", "(1 - target.person)"),
     Fault("blend-outside", "training/losses", " + (1 - samples.in_box) * samples.alpha", ""),
     Fault("paper-box-samples", "fields/paper", "stratified(entry, leave, ", "stratified(near, far, "),
@@ -137,6 +139,8 @@ FAULTS = (
     Fault("fast-normal-unturned", "body/canonical", "(linear * directions[:, None]).sum(-1)", "directions",
           "fields/fast_ray"),
     Fault("plates-hidden", "training/plates", "cv2.dilate(mask, disc) > 0", "mask > 0"),
+    Fault("mask-beyond-reach", "training/gather", "visible_pixels(camera, vertices_m) | mask",
+          "visible_pixels(camera, vertices_m)", "training/pixels"),
     Fault("plates-known", "training/gather", "plates[c].known | ~edge", "plates[c].known | edge", "training/pixels"),
     Fault("fast-pose-code", "fields/grids", "code.index_select(0, row)", "0 * code.index_select(0, row)"),
     Fault("fast-residual-unit", "fields/grids", "self.unit_m * last(", "last("),
@@ -165,7 +169,9 @@ FAULTS = (
     Fault("fast-tighten-sides", "fields/fast", "side * described.d[seen]", "-side * described.d[seen]",
           "training/tighten"),
     Fault("fast-tighten-poses", "fields/fast", "seen |= described.near", "seen = described.near", "training/tighten"),
-    # what the trainer passes to a step
+    # what the trainer passes to a step, and its curve
+    Fault("curve-outlines", "training/fixed_rays", "[rays.person & ~mixed]", "[rays.person]"),
+    Fault("curve-scene", "training/fixed_rays", "box_colour(samples)", "samples.colour[:, 0]"),
     Fault("trainer-noise", "training/trainer", "self.scene.with_noise(s.noise, self.generator)", "self.scene",
           "training/trainer_step"),
     Fault("trainer-view-noise", "training/trainer", "samples, s.noise, self.generator)",

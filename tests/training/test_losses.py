@@ -52,6 +52,13 @@ def test_mask_ignores_samples_outside_the_box():
     assert losses.mask(outside, TARGET).item() == pytest.approx(0.5 / 2)
 
 
+def test_mask_and_blend_leave_out_weightless_rays():
+    """Ray 0, the person's, does not count: only the error of C^ of ray 1 is left."""
+    unweighted = replace(TARGET, weight=torch.tensor([0.0, 1.0]))
+    assert losses.mask(SAMPLES, unweighted).item() == 0
+    assert losses.blend(SAMPLES, unweighted, eta=0.25).item() == pytest.approx(0.25 * 0.2 / 2)
+
+
 def test_fog():
     """Ray 1 misses the person. Its C~ is (0, 0.2, 0) with all samples in the box, and black if its fog is outside."""
     assert losses.fog(replace(SAMPLES, in_box=torch.ones(2, 2)), TARGET).item() == pytest.approx(0.2 / 2)

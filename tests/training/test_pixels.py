@@ -112,6 +112,14 @@ def test_an_image_that_the_body_does_not_reach_has_no_pixels(tmp_path: Path) -> 
     assert int(pixels.image_starts.diff()[1]) == 0 < int(pixels.image_starts.diff()[2])
 
 
+def test_pixels_of_a_mask_are_gathered_where_the_body_does_not_reach(tmp_path: Path) -> None:
+    """The fit may be wrong there: the mask alone says which pixels show the person."""
+    capture, masks, body = record(tmp_path)
+    pixels = gather_pixels(capture, masks, body, lambda *_: np.zeros((SIZE_PX, SIZE_PX), bool), {}, tmp_path, ALONE)
+    shown = sum(masks.get(name, frame).sum() for name in capture.train_cameras for frame in body.frames)
+    assert pixels.person.all() and len(pixels.person) == shown > 0
+
+
 def test_outline_pixels_with_an_unknown_background_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
