@@ -78,6 +78,16 @@ def test_a_field_without_a_closed_surface_is_refused(offset_m: float, message: s
         extract_surface(lambda p: sphere(p) + offset_m, LOWER_M, UPPER_M, 32)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_surface_that_one_side_of_the_box_cuts_is_refused(axis: int, side: int) -> None:
+    """Its middle is on that side of the box."""
+    middle_m = torch.zeros(3)
+    middle_m[axis] = (LOWER_M if side < 0 else UPPER_M)[axis]
+    with pytest.raises(InputError, match="fills its box"):
+        extract_surface(lambda points_m: sphere(points_m - middle_m), LOWER_M, UPPER_M, 32)
+
+
 def test_normals_and_distances_by_hand() -> None:
     """The first function is 6 + 3 y + 4 z at (1, 2, 3). The second is the squared distance from the origin at (0, 0,
     2): sampled half a metre away in four directions that cancel out, its mean is 2^2 + (1/2)^2."""

@@ -62,3 +62,13 @@ def test_pictures_of_a_surface_are_what_their_captions_say() -> None:
         assert found[f"Surface, {side}"][0] > 180 and found[f"Surface, {side}"][1] == 255
         assert found[f"Ground truth, {side}"][0] > 180 and found[f"Ground truth, {side}"][1] < 255
         assert found[f"Distance, {side}"][0] < 130 and found[f"Distance, {side}"][1] == 255
+
+
+def test_the_front_is_seen_from_ahead_and_the_back_from_behind() -> None:
+    """The body faces -Y. A large ball and a small one to its left, at +X, are seen on the left and on the right from
+    ahead, and the other way round from behind. Above their middles, there is only the large one."""
+    large, small = (trimesh.creation.icosphere(3, radius_m) for radius_m in (0.1, 0.04))
+    both = trimesh.util.concatenate(large, small.apply_translation([0.3, 0, 0]))
+    found = levels(surface_row(0, both, None, np.eye(4), ""), (0.4, 0.22), (0.4, 0.78))
+    assert found["Surface, front"][0] < 255 == found["Surface, front"][1]
+    assert found["Surface, back"][1] < 255 == found["Surface, back"][0]

@@ -30,6 +30,12 @@ def test_normal_consistency_of_tilted_planes() -> None:
     assert score["normal_consistency"] == pytest.approx(0.5, abs=1e-6)  # cos 60 degrees everywhere
 
 
+def test_normal_consistency_ignores_which_way_faces_point() -> None:
+    turned = trimesh.Trimesh(plane(0.1).vertices, plane().faces[:, ::-1], process=False)
+    score = score_geometry(plane(), turned, np.random.default_rng(0), samples=2000, nodes=16)
+    assert score["normal_consistency"] == pytest.approx(1.0)
+
+
 def test_distances_are_to_the_surface_not_to_samples() -> None:
     score = score_geometry(cube(), cube(), np.random.default_rng(0), samples=500, nodes=16)
     assert score["chamfer_mm"] < 1e-3
