@@ -138,3 +138,15 @@ def test_the_elastic_energy_of_a_displacement() -> None:
     assert moved.elastic is not None
     expect_close(moved.elastic, [4.0])
     assert moved.d.min() < 0 < moved.d.max() < 0.06
+
+
+def test_samples_out_of_reach_have_no_elastic_energy() -> None:
+    """The shell is 1 cm thick outside, and its cells of 2 cm hold samples beyond. The others have energy 4."""
+    field = field_of(no_residual, nodes=1, rig=FINE_RIG)
+    assert field.deformation is not None
+    field.deformation.displacement.data[1, 0, 0] = 0.02
+    field.outer_m.fill_(0.01)
+    samples = sampled(field, rig=FINE_RIG)
+    share = (samples.d < field.reach_m).float().mean().item()
+    assert samples.elastic is not None and 0.5 < share < 1
+    expect_close(samples.elastic, [4.0 * share])

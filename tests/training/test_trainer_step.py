@@ -160,6 +160,21 @@ def test_bodies_absorb_the_learned_corrections(tmp_path: Path, kind: str) -> Non
 
 
 @pytest.mark.usefixtures("any_surface")
+def test_the_change_of_a_single_training_frame_stays_in_its_pose(tmp_path: Path) -> None:
+    """The rest body would pass it on to poses of other frames, which it does not concern."""
+    capture, masks, body = record(tmp_path / "capture")
+    capture = dataclasses.replace(capture, train_frames=capture.train_frames[:1])
+    trainer = Trainer(capture, masks, body, tiny(), tmp_path, ALONE)
+    before = trainer.scene.conditions.pose
+    with torch.no_grad():
+        trainer.objective.correction.turn[0, 0, 1] = 0.1
+    trainer.step = 1
+    trainer._absorb()
+    assert (trainer.scene.conditions.pose - before)[:, 1].tolist() == pytest.approx([0.1, 0, 0], abs=1e-6)
+    torch.testing.assert_close(trainer.scene.bodies.rig.vertices_m, body.rig.vertices_m)
+
+
+@pytest.mark.usefixtures("any_surface")
 @H_NERF
 def test_with_one_camera_the_mean_distance_of_the_fit_is_kept(tmp_path: Path, kind: str) -> None:
     """Two bodies stand at the origin, at a distance L from the camera at c. The first learns to stand at 1.1 L: the
