@@ -100,6 +100,8 @@ FAULTS = (
     Fault("blend-eta", "training/losses", "eta * (1 - target.person)", "(1 - target.person)"),
     Fault("blend-outside", "training/losses", " + (1 - samples.in_box) * samples.alpha", ""),
     Fault("paper-box-samples", "fields/paper", "stratified(entry, leave, ", "stratified(near, far, "),
+    Fault("paper-beyond-the-scene", "fields/paper", "(t.clamp(near, far) for t in box.interval(rays))",
+          "box.interval(rays)"),
     Fault("paper-walks-out", "fields/paper", "torch.maximum(self.centre_m + half_m, box.upper_m[rays.frame])",
           "self.centre_m + half_m"),
     Fault("paper-root-origin", "fields/paper", "(conditions.root - centre.flatten())", "conditions.root"),
@@ -398,6 +400,8 @@ FAULTS = (
     Fault("surface-closed-truth", "evaluation/geometry", "bool(predicted.is_watertight)", "bool(truth.is_watertight)"),
     Fault("ssim-sample-covariance", "evaluation/metrics", 'covariance": False', 'covariance": True'),
     Fault("psnr-amplitude", "evaluation/metrics", "-10 * np.log10(", "-20 * np.log10("),
+    Fault("pose-of-each-joint", "study/benchmark/training_distance", "angle_deg.sum(1).min()",
+          "angle_deg.amin(0).sum()"),
     # retries, resumed work and cached results
     Fault("retry-lost-worker", "tasks/policy", "OSError | LostWorkerError)", "OSError)"),
     Fault("retry-permanent", "tasks/policy", " and not is_permanent(error)", ""),

@@ -110,12 +110,16 @@ def test_box_samples_lie_only_in_the_box() -> None:
     expect_close(field.radiance.asked[0][0][:, 0], torch.tensor([-0.5, -0.125, 0.175, 0.5]))
 
 
-def test_a_ray_that_misses_the_box_has_all_its_samples_in_the_scene() -> None:
+@pytest.mark.parametrize(("y_m", "slope"), [(1.9, 0.0), (-1.0, 0.1)])
+def test_a_ray_that_misses_the_box_has_all_its_samples_in_the_scene(y_m: float, slope: float) -> None:
+    """The first ray passes B along x. The second comes level with B only 4 m beyond the end of the scene."""
     field = field_of(static=True, box_samples=2)
-    beside = replace(RAY, origins_m=torch.tensor([[-1.0, 1.9, 0.25]]))
+    along = torch.nn.functional.normalize(torch.tensor([[1.0, slope, 0.0]]), dim=1)
+    beside = replace(RAY, origins_m=torch.tensor([[-1.0, y_m, 0.25]]), directions=along)
     samples, depths = field.sample(field.scene(*bodies()), beside, DRAWS)
     assert samples.in_box.sum() == 0 and samples.alpha.isfinite().all()
-    assert (depths.diff() >= 0).all() and depths.min() >= 1 and depths.max() <= 5
+    ahead_m = depths * along[0, 0]
+    assert (depths.diff() >= 0).all() and ahead_m.min() >= 1 and ahead_m.max() <= 5
 
 
 @pytest.mark.parametrize("walk_m", [6.0, -6.0])

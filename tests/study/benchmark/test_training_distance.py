@@ -40,3 +40,13 @@ def test_the_distance_of_a_pose_is_the_mean_turn_of_free_joints_from_the_nearest
     assert pose_distances_deg(body, [14], [12])[14] == pytest.approx(60.0, abs=1e-4)
     one = dataclasses.replace(body, rig=dataclasses.replace(rig, free=torch.tensor([False, True])))
     assert pose_distances_deg(one, [14], [12])[14] == pytest.approx(120.0, abs=1e-4)
+
+
+def test_the_nearest_pose_is_one_for_all_joints() -> None:
+    """Frame 2 bends both joints by 60 degrees, frames 0 and 1 one of them each: either is 60 degrees off in the other
+    joint."""
+    rig = dataclasses.replace(box_rig(), free=torch.tensor([True, True]))
+    theta = torch.zeros(3, 2, 3)
+    theta[0, 0, 1] = theta[1, 1, 1] = theta[2, :, 1] = np.pi / 3
+    body = BodyFit(rig, (0, 1, 2), theta, torch.eye(4).repeat(3, 1, 1))
+    assert pose_distances_deg(body, [2], [0, 1])[2] == pytest.approx(30.0, abs=1e-4)
