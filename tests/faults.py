@@ -400,6 +400,9 @@ FAULTS = (
     Fault("surface-closed-truth", "evaluation/geometry", "bool(predicted.is_watertight)", "bool(truth.is_watertight)"),
     Fault("ssim-sample-covariance", "evaluation/metrics", 'covariance": False', 'covariance": True'),
     Fault("psnr-amplitude", "evaluation/metrics", "-10 * np.log10(", "-20 * np.log10("),
+    Fault("flat-half", "study/benchmark/convergence", "LAST_SHARE = 1 / 3 ", "LAST_SHARE = 1 / 2 "),
+    Fault("ahead-somewhere", "study/benchmark/claims", "yield min(leads) > 0", "yield max(leads) > 0"),
+    Fault("claims-of-all", "study/benchmark/claims", 'result["own"][:1]', 'result["own"]'),
     Fault("pose-of-each-joint", "study/benchmark/training_distance", "angle_deg.sum(1).min()",
           "angle_deg.amin(0).sum()"),
     # retries, resumed work and cached results

@@ -142,6 +142,13 @@ def test_quality_by_view_angle_and_lead_at_every_angle() -> None:
     assert failed.startswith("no: 4 cameras: fast nothing, nerf has scores; 2 cameras: +8.0")
 
 
+def test_a_lead_at_most_angles_is_not_one_at_every_angle() -> None:
+    """At 30 degrees, `nerf` is 5 dB better than `fast`, which is ahead elsewhere."""
+    result = synthetic_result("ahead_at_every_angle")
+    result["variants"]["4 cameras"]["methods"]["nerf"]["novel_view"]["per_image"][1]["psnr"] += 9.0
+    assert verdict(result).startswith("no: 4 cameras: -5.0 to +4.0 dB to nerf; ")
+
+
 def test_only_bins_of_angles_that_both_methods_have_are_compared() -> None:
     """With bodies fitted under other settings, an image falls into the next bin, or is not there."""
     result = synthetic_result("ahead_at_every_angle")
@@ -214,6 +221,17 @@ def test_no_claim_is_checked_if_no_preset_of_the_method_ran(check: str) -> None:
 @pytest.mark.parametrize("check", ["loses_least", "ahead", "ahead_at_every_angle", "others_have_no_surface"])
 def test_further_presets_of_the_method_do_not_count_as_other_methods(check: str) -> None:
     assert verdict(synthetic_result(check) | {"own": ["fast", "nerf"]}) == "no figures."
+
+
+def test_claims_are_about_the_first_preset_of_the_method() -> None:
+    """A second one would be behind `idr`."""
+    result = synthetic_result("ahead") | {"own": ["fast", "nerf"]}
+    for n in (4, 2):
+        result["variants"][f"{n} cameras"]["methods"]["idr"] = of_method(27.0, 0.3, 0.05, n, 0.1)
+    assert verdict(result) == (
+        "yes: 4 cameras: fast 30.0 dB, idr 27.0 dB; 4 cameras: fast Chamfer 0.100, idr Chamfer 0.300; "
+        "2 cameras: fast 28.0 dB, idr 27.0 dB; 2 cameras: fast Chamfer 0.200, idr Chamfer 0.300."
+    )
 
 
 def test_all_other_methods_are_checked_if_the_method_failed() -> None:

@@ -20,6 +20,7 @@ def test_training_times_double_up_to_the_limit() -> None:
         ([(160.0, 20.0), (320.0, 20.0)], False),  # too short
         ([(160.0, 22.0), (320.0, 20.0), (640.0, 21.0)], True),  # the best earlier value counts
         ([(100.0, 20.0), (500.0, 20.5), (640.0, 20.55)], False),  # 500 s is in the last third, too
+        ([(100.0, 20.0), (400.0, 20.5), (640.0, 20.55)], True),  # 400 s is not
         ([(640.0, 20.0)], False),
         ([], False),
     ],
