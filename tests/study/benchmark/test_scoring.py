@@ -37,7 +37,13 @@ from tests.evaluation.ball import (
 from tests.full_disk import files_up_to
 
 GAP_M = 0.01  # between the ball and its true surface
-GREYS = {"training": 102, "5": 51, "10": 76.5, "12": 0}  # of 255: the finished model, and snapshots by their seconds
+GREYS = {
+    "training": 102,
+    "5": 51,
+    "10": 76.5,
+    "12": 0,
+    "14": 0,
+}  # of 255: the end, and snapshots
 SETTINGS = ScoringSettings(meshes=1, snapshot_images=2, snapshot_meshes=0, frame_sizes_px=(16, 32))
 
 
@@ -55,10 +61,16 @@ class SizedBall(BallAvatar):
 def scored(
     base: Path, test_cameras: tuple[str, ...], settings: ScoringSettings = SETTINGS, kind: str = "fast"
 ) -> dict[str, Any]:
-    """Score, into `base`/out, a training of 15 s whose field took 12 s, with snapshots up to the field's end."""
+    """Score, into `base`/out, a training of 15 s whose field took 12 s, with snapshots up to the field's end and one of
+    later, when only poses of novel frames change."""
     training = base / "training"
     stored = {"static": False, "training": {"field": {"kind": kind}, "pose_learning_rate": 0}}
-    for name, seconds in {"5": 6.5, "10": 10.0, "12": 12.0}.items():  # the first was taken late, after a long step
+    for name, seconds in {
+        "5": 6.5,
+        "10": 10.0,
+        "12": 12.0,
+        "14": 14.0,
+    }.items():  # the first was taken late, after a long step
         folder = training / "snapshots" / name
         folder.mkdir(parents=True)
         (folder / "settings.json").write_text(json.dumps(stored | {"seconds": seconds}))

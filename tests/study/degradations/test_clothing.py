@@ -104,8 +104,9 @@ def test_a_garment_is_drawn_where_the_body_does_not_hide_it(tmp_path: Path) -> N
     """A column 1 m high and 0.5 m wide, 4 m from a camera of 16 px focal length, is about 4 x 2 px around the middle;
     where it is nearest, at 3.75 m, half a metre is 2.13 px."""
     bad, _ = dressed(tmp_path)
-    changed = {name: np.abs(bad.image(name, 2).astype(int) - 102).max(-1) > 40 for name in bad.cameras}
-    assert not changed["01"].any()
+    off = {name: np.abs(bad.image(name, 2).astype(int) - 102).max(-1) for name in bad.cameras}
+    changed = {name: levels > 40 for name, levels in off.items()}
+    assert off["01"].max() <= 3  # JPEG; in the body's shadow, the column would be 40 levels brighter at most
     for name in ("02", "03"):
         assert changed[name][6:10, 7:9].all()
         assert changed[name].sum() == 8

@@ -36,7 +36,7 @@ def test_noise_leaves_detections_unchanged(tmp_path: Path) -> None:
 
 def test_blur_spreads_by_a_share_of_the_width(tmp_path: Path) -> None:
     good = write_recording(tmp_path / "good")
-    dot = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
+    dot = np.zeros((2 * SIZE_PX, SIZE_PX, 3), np.uint8)  # the height does not count
     dot[8, 8] = 255
     write_image(good.root / "images" / "01" / "000002.png", dot)
     blur(good, 6.25, np.random.default_rng(0), tmp_path / "bad")  # 1 px

@@ -9,13 +9,13 @@ from hnerf.errors import NotApplicableError
 from hnerf.study.degradations.catalogue import Degradation
 from tests.study.recording import write_recording
 
-SIZE_PX = 100
+WIDTH_PX, HEIGHT_PX = 100, 200
 BOX = slice(20, 60), slice(30, 70)  # 40 x 40
 
 
 def masks() -> Masks:
     """Return masks of one box in frames 2 and 4 of camera 01."""
-    mask = np.zeros((SIZE_PX, SIZE_PX), bool)
+    mask = np.zeros((HEIGHT_PX, WIDTH_PX), bool)
     mask[BOX] = True
     return Masks({("01", frame): encode(mask) for frame in (2, 4)}, {"cameras": {}})
 
