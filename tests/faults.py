@@ -127,6 +127,11 @@ FAULTS = (
     Fault("fit-clothed", "training/step", "segmentation(samples.d, target", "segmentation(samples.d_hat, target"),
     Fault("segmentation-naked", "training/step", "segmentation(samples.d_hat, target",
           "segmentation(samples.d, target"),
+    # units of the compared methods' densities
+    Fault("box-density-unit", "baselines/box", "append=far_m[:, None]) / self.scale_m", "append=far_m[:, None])",
+          "baselines/nerf"),
+    Fault("box-surface-unit", "baselines/box", "SURFACE_DENSITY_PER_M * self.scale_m", "SURFACE_DENSITY_PER_M",
+          "baselines/nerf"),
     # targets of a training step
     Fault("fast-edge-pixels", "training/step", "(~rays.edge).float()), draws", "everywhere), draws"),
     Fault("plate-ignored", "training/step", "if rays.plate is not None:", "if False:"),

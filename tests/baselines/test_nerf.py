@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hnerf.avatar.trained import build_field
-from hnerf.baselines.box import BAND_M, SURFACE_DENSITY_PER_M
+from hnerf.baselines.box import BAND_M
 from hnerf.baselines.nerf import NerfField
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
@@ -42,20 +42,20 @@ class Fog(torch.nn.Module):
 
 
 class Roomy(NerfField):
-    margin_m = 0.5
+    margin_m = 1.5
 
 
 @pytest.fixture
 def fog() -> NerfField:
-    """Return a field over the unit box with a margin of 0.5 m, so its half edge is 1 m. The coarse fog is thin and
-    dark, the fine one dense and bright."""
+    """Return a field over the unit box with a margin of 1.5 m, so its half edge, the unit of densities, is 2 m. The
+    coarse fog is thin and dark, the fine one dense and bright."""
     field = Roomy(body(), load_settings("nerf").training.field)
     field.coarse, field.fine = Fog(0.5, 0.25), Fog(2.0, 0.75)
     return field
 
 
 def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
-    """Sample two rays over white: one through the middle of the box, 2 m of it inside, and one that misses it."""
+    """Sample two rays over white: one through the middle of the box, 4 m of it inside, and one that misses it."""
     fit = body()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
@@ -66,8 +66,8 @@ def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
 
 
 def test_coarse_and_fine_colours_by_hand(fog: NerfField) -> None:
-    """Samples lie at the start of strata of 2 m / 24, so both networks see the whole 2 m. Fine: 0.75 (1 - e^-4) + e^-4;
-    coarse: 0.25 (1 - e^-1) + e^-1. The ray that misses the box sees white."""
+    """Samples lie at the start of strata of 4 m / 24, so both networks see the whole 4 m, or 2 units. Fine: 0.75 (1 -
+    e^-4) + e^-4; coarse: 0.25 (1 - e^-1) + e^-1. The ray that misses the box sees white."""
     still = Draws.deterministic(2, 24, torch.device("cpu"))
     zero = torch.zeros(2, 24)
     samples, depths = look(fog, dataclasses.replace(still, jitter=zero, fine=zero))
@@ -76,34 +76,34 @@ def test_coarse_and_fine_colours_by_hand(fog: NerfField) -> None:
     fine, coarse = 0.75 + 0.25 * math.exp(-4), 0.25 + 0.75 * math.exp(-1)
     assert reconstruction(samples, target).item() == pytest.approx(3 * (fine + 1) / 2, abs=1e-4)
     assert blend(samples, target, 1.0).item() == pytest.approx(3 * (coarse + 1) / 2, abs=1e-4)
-    assert depths[0, 0].item() == pytest.approx(2.5)  # the box starts at x = -0.5
+    assert depths[0, 0].item() == pytest.approx(1.5)  # the box starts at x = -1.5
 
 
 def test_fine_samples_concentrate_where_the_coarse_network_has_density(fog: NerfField) -> None:
-    """The coarse network has an opaque wall from 4 m on. The 24 fine samples lie in the cell where it begins, which
-    extends half-way to the neighbouring samples, 2 m / 24 apart."""
+    """The coarse network has an opaque wall from 4.5 m on. The 24 fine samples lie in the cell where it begins, which
+    extends half-way to the neighbouring samples, 4 m / 24 apart."""
 
     class Wall(Fog):
         def forward(self, point: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
-            return 1e4 * (point[..., 0] > 0.5).float(), torch.zeros_like(point)  # x > 1 m
+            return 1e4 * (point[..., 0] > 0.5).float(), torch.zeros_like(point)  # x > 1.5 m
 
     fog.coarse = Wall(0, 0)
     _, depths = look(fog, Draws.deterministic(2, 24, torch.device("cpu")))
-    first = 4 + 1 / 24  # the first coarse sample behind the wall's face
-    assert ((depths[0, 24:] - first).abs() <= 1 / 24 + 1e-4).sum() >= 24
+    first = 4.5 + 1 / 12  # the first coarse sample behind the wall's face
+    assert ((depths[0, 24:] - first).abs() <= 1 / 12 + 1e-4).sum() >= 24
 
 
 def test_the_surface_is_where_the_density_is_sigma_h(fog: NerfField) -> None:
-    """With a half edge of 1 m, sigma_h is 20 per unit. The distance is 0 there, BAND_M in empty space and -BAND_M / 3
+    """With a half edge of 2 m, sigma_h is 40 per unit. The distance is 0 there, BAND_M in empty space and -BAND_M / 3
     at twice sigma_h."""
     fit = body()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, fog.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
-    for density, distance in ((SURFACE_DENSITY_PER_M, 0.0), (0.0, BAND_M), (2 * SURFACE_DENSITY_PER_M, -BAND_M / 3)):
+    for density, distance in ((40.0, 0.0), (0.0, BAND_M), (80.0, -BAND_M / 3)):
         fog.fine = Fog(density, 0)
         found = fog.signed_distance(bodies, torch.full((1, 3), 0.5), conditions)
         assert found.item() == pytest.approx(distance, abs=1e-7)
-    outside = torch.tensor([[4.5, 4.5, 0.5]])  # 3 m beyond the box along x and y: the density does not count here
+    outside = torch.tensor([[5.5, 5.5, 0.5]])  # 3 m beyond the box along x and y: the density does not count here
     assert fog.signed_distance(bodies, outside, conditions).item() == pytest.approx(3 * 2**0.5, rel=1e-6)
 
 
@@ -132,6 +132,7 @@ def test_overfits_the_ball(tmp_path: Path) -> None:
 def test_visible_pixels_are_all_that_see_the_box(fog: NerfField, tmp_path: Path) -> None:
     """A camera 2 m from the centre of a box of 2 m sees its near side, 1 m away, in the whole image. A camera 12 m away
     sees the box in the middle of the image but not in the corner."""
+    fog.margin_m = 0.5
     camera = record(tmp_path)[0].cameras["0"]
     vertices_m = body().vertices_m()[0].numpy()
     assert fog.visible_pixels(camera, vertices_m).all()
