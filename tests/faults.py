@@ -132,6 +132,11 @@ FAULTS = (
           "baselines/nerf"),
     Fault("box-surface-unit", "baselines/box", "SURFACE_DENSITY_PER_M * self.scale_m", "SURFACE_DENSITY_PER_M",
           "baselines/nerf"),
+    Fault("idr-inside", "baselines/idr", "d - d.detach() - INSIDE_LOGIT / self.gamma", "d - INSIDE_LOGIT / self.gamma"),
+    Fault("idr-nearest", "baselines/idr", "hit & (least > 0)", "hit & (least < 0)"),
+    Fault("idr-secant", "baselines/idr", "torch.where(outside, middle, start)", "torch.where(outside, start, middle)"),
+    Fault("nerfies-elastic-of-air", "baselines/nerfies", "weights.sum(1) * elastic_energy(", "elastic_energy("),
+    Fault("voxels-level", "baselines/voxels", "self.edge_m * 2**level", "self.edge_m * (level + 1)"),
     # targets of a training step
     Fault("fast-edge-pixels", "training/step", "(~rays.edge).float()), draws", "everywhere), draws"),
     Fault("plate-ignored", "training/step", "if rays.plate is not None:", "if False:"),

@@ -2,12 +2,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from hnerf.baselines.idr import SdfNetwork, intersection, trace_surface
+from hnerf.baselines.idr import IdrField, SdfNetwork, intersection, trace_surface
+from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
+from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.rays import Rays
-from tests.baselines.ball import RADIUS_M, RING, inner_psnr, psnr, radii_m, trained
+from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
 
 SMALL = [
     "training.steps=150",
@@ -46,10 +48,10 @@ def test_rays_hit_the_unit_sphere_at_exact_depths() -> None:
 @pytest.mark.parametrize("slope", [0.05, 2.0])
 def test_the_secant_method_corrects_failed_sphere_tracing(slope: float) -> None:
     """Distances twenty times too small stop tracing early; twice too large, they lead to the far side. The signs at the
-    samples reveal the crossing."""
-    origins, directions = torch.tensor([[-3.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]])
+    samples reveal the crossing. Off the centre, distances along the ray are not linear."""
+    origins, directions = torch.tensor([[-3.0, 0.0, 0.0], [-3.0, 0.6, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]] * 2)
     depth, hit = traced(lambda x: slope * sphere(x), origins, directions)
-    assert hit.all() and depth.item() == pytest.approx(2.0, abs=1e-3)
+    assert hit.all() and depth.tolist() == pytest.approx([2.0, 2.2], abs=1e-3)
 
 
 def test_rays_hit_the_first_of_two_surfaces() -> None:
@@ -104,6 +106,45 @@ def test_gradients_of_the_intersection_match_finite_differences() -> None:
     ray = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
     intersection(straight, ray, straight.norm(dim=-1) - radius, straight)[0, 0].backward()
     assert radius.grad is not None and radius.grad.item() == pytest.approx(-1.0)
+
+
+class Ball(nn.Module):
+    """A stand-in for the network: a ball of half a unit, which is 30 cm here."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.middle, self.width = nn.Parameter(torch.zeros(3)), width
+
+    def forward(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        return (point - self.middle).norm(dim=-1) - 0.5, point.new_zeros(*point.shape[:-1], self.width)
+
+
+def test_distances_of_rays_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three rays along x, 10, 35 and 0 cm beside the ball's middle, cross the box from 2.9 to 4.1 m. The first hits the
+    ball 28 cm before 3.5 m, between its samples, and the third 30 cm before, with a sample in the middle. Their
+    distance is 10 / gamma inside. For the first, a change of the ball's y changes it by - 60 cm x 10 / 30 a unit. The
+    second ray is 5 cm from the ball at 3.5 m. The eikonal loss is measured in the box, at .25, .5 and .75 of its edges
+    of 1.2 m."""
+    fit = body()
+    settings = load_settings("idr").training.field
+    field = IdrField(fit, settings)
+    field.geometry = Ball(settings.width)
+    bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
+    conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
+    origins = torch.tensor([[-3.0, 0.6, 0.5], [-3.0, 0.85, 0.5], [-3.0, 0.5, 0.5]])
+    rays = Rays(origins, torch.tensor([[1.0, 0, 0]] * 3), torch.zeros(3, dtype=torch.long))
+    jitter = torch.tensor([[0.0, 0.9], [0.5, 0.0], [0.5, 0.0]])  # at 2.9 and 4.04 m; at 3.2 and 3.5 m
+    fine = torch.tensor([[0.25, 0.5, 0.75]] * 3)
+    asked, evaluate = [], field._evaluate
+    monkeypatch.setattr(field, "_evaluate", lambda points_m: asked.append(points_m) or evaluate(points_m))
+    samples, depths = field.sample(field.scene(bodies, conditions), rays, Draws(jitter, 0 * fine, fine, torch.zeros(3)))
+    assert samples.alpha.tolist() == [[1.0], [0.0], [1.0]]
+    assert depths.flatten().tolist() == pytest.approx([3.5 - 0.08**0.5, 4.1, 3.2], abs=2e-4)
+    assert samples.d.flatten().tolist() == pytest.approx([-10 / 50, 0.05, -10 / 50], abs=1e-4)
+    slope = torch.autograd.grad(samples.d[0, 0], field.geometry.middle)[0]
+    assert slope[1].item() == pytest.approx(-0.6 / 3, abs=1e-3)
+    torch.testing.assert_close(asked[-1].detach(), torch.tensor([[0.2, 0.5, 0.8]] * 3))
+    torch.testing.assert_close(samples.gradient_norm, torch.ones(3))
 
 
 def test_the_untrained_network_is_a_sphere() -> None:

@@ -150,6 +150,14 @@ def test_rigid_motions_have_no_elastic_loss_and_stretching_has(field: NerfiesFie
     assert rigid.item() < 1e-6 and swollen.item() > 1e-2
 
 
+def test_empty_space_has_no_elastic_loss(field: NerfiesField, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The energy counts as much as its ray is opaque, here not at all."""
+    torch.nn.init.normal_(field.deformation.screw.weight)
+    monkeypatch.setattr(field.template, "forward", lambda point, view: (0 * point[..., 0], 0 * point))
+    found = evaluate(field, training=True).elastic
+    assert found is not None and found.item() == 0
+
+
 def test_the_deformation_uses_all_octaves_only_after_annealing(field: NerfiesField) -> None:
     """After the annealing share of training, a random screw sees the complete encoding; before that, it does not."""
     assert field.settings.anneal_share == 0.3333

@@ -86,3 +86,11 @@ def test_every_vertex_is_assigned_its_nearest_voxel() -> None:
     assert places.tolist() == [[0, 0, 0], [0, 0, 0], [1, 0, 0], [0, 0, 3]]
     assert voxels.count[voxels.vertex].tolist() == [2, 2, 1, 1]
     torch.testing.assert_close(voxels.coordinates(points[3:], 1), torch.tensor([[0.0, 0.0, 1.5]]), atol=1e-5, rtol=0)
+
+
+def test_coordinates_halve_from_level_to_level() -> None:
+    """The point is 8 edges of 5 cm from the lower corner along x, 4 along y and 2 along z."""
+    voxels = Voxels.around(torch.tensor([[0.1, 0.2, 0.3], [0.6, 0.7, 0.8]]), 0.05, 4)
+    point_m = torch.tensor([[0.5, 0.4, 0.4]])
+    found = torch.cat([voxels.coordinates(point_m, level) for level in range(4)])
+    torch.testing.assert_close(found, torch.tensor([[8.0, 4, 2], [4, 2, 1], [2, 1, 0.5], [1, 0.5, 0.25]]))
