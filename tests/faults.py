@@ -137,6 +137,9 @@ FAULTS = (
     Fault("idr-secant", "baselines/idr", "torch.where(outside, middle, start)", "torch.where(outside, start, middle)"),
     Fault("nerfies-elastic-of-air", "baselines/nerfies", "weights.sum(1) * elastic_energy(", "elastic_energy("),
     Fault("voxels-level", "baselines/voxels", "self.edge_m * 2**level", "self.edge_m * (level + 1)"),
+    Fault("neural-body-frame", "baselines/neural_body", "self.code(conditions)[row]", "self.code(conditions)[0 * row]"),
+    Fault("neural-body-sum", "baselines/neural_body",
+          "total / torch.cat([voxels.count, voxels.count.new_ones(1)])[:, None]", "total"),
     # targets of a training step
     Fault("fast-edge-pixels", "training/step", "(~rays.edge).float()), draws", "everywhere), draws"),
     Fault("plate-ignored", "training/step", "if rays.plate is not None:", "if False:"),
@@ -151,6 +154,8 @@ FAULTS = (
     Fault("fast-normal-unturned", "body/canonical", "(linear * directions[:, None]).sum(-1)", "directions",
           "fields/fast_ray"),
     Fault("plates-hidden", "training/plates", "cv2.dilate(mask, disc) > 0", "mask > 0"),
+    Fault("rays-transposed", "training/gather", "c.R.T @ np.linalg.inv(c.K)", "c.R @ np.linalg.inv(c.K)",
+          "training/pixels"),
     Fault("mask-beyond-reach", "training/gather", "visible_pixels(camera, vertices_m) | mask",
           "visible_pixels(camera, vertices_m)", "training/pixels"),
     Fault("plates-known", "training/gather", "plates[c].known | ~edge", "plates[c].known | edge", "training/pixels"),

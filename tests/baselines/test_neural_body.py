@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from hnerf.baselines.neural_body import NeuralBodyField, NeuralBodyRegion
+from hnerf.baselines.neural_body import LEVELS, Diffusion, NeuralBodyField, NeuralBodyRegion
+from hnerf.baselines.voxels import Voxels
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.fields.conditions import Conditions, Draws
@@ -96,6 +97,27 @@ def test_appearance_codes_are_per_frame_and_zero_for_novel_poses(field: NeuralBo
 
     torch.testing.assert_close(colour(-1), colour(1))
     assert (colour(0) - colour(1)).abs().max() > 0.01
+
+
+def test_rays_take_the_appearance_of_their_own_frames(field: NeuralBodyField) -> None:
+    region = field.region(*posed(field))
+    before = look(field, region, [0, 2])
+    with torch.no_grad():
+        field.codes[2] = 3.0
+    after = look(field, region, [0, 2])
+    torch.testing.assert_close(after[0], before[0])
+    assert (after[1] - before[1]).abs().max() > 0.01
+
+
+def test_codes_of_vertices_in_the_same_voxel_are_averaged() -> None:
+    """Of three vertices, the first two share a voxel. A single one there with the mean of their codes gives the same
+    features."""
+    torch.manual_seed(0)
+    diffusion, codes = Diffusion(3, 4), torch.randn(3, 3)
+    points_m = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0.3, 0.1, 0]])
+    found = diffusion(codes, Voxels.around(points_m, 0.1, LEVELS))
+    mean = torch.stack([codes[:2].mean(0), codes[2]])
+    torch.testing.assert_close(found, diffusion(mean, Voxels.around(points_m[[0, 2]], 0.1, LEVELS)))
 
 
 def test_overfits_two_frames_and_does_not_generalise_to_a_novel_pose(tmp_path: Path) -> None:

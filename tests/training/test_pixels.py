@@ -88,6 +88,10 @@ def test_gathered_pixels_equal_those_of_the_images(tmp_path: Path, visible_pixel
             assert len(x) == 32 * 32 if visible_pixels is None else 0 < len(x) < 32 * 32
             assert np.array_equal(pixels.colour[part].numpy(), capture.image(name, frame)[y, x])
             assert np.array_equal(pixels.person[part].numpy(), masks.get(name, frame)[y, x])
+            origins_m, directions = pixels.rays(camera[part], xy_px[part])
+            centre_m, wanted = capture.cameras[name].rays(xy_px[part].numpy().astype(float))
+            np.testing.assert_allclose(directions, wanted, atol=1e-6)
+            np.testing.assert_allclose(origins_m, np.broadcast_to(centre_m, wanted.shape), atol=1e-6)
             assert pixels.edge[part].any()
 
 
