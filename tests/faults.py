@@ -341,6 +341,8 @@ FAULTS = (
     Fault("live-camera", "render/live", "as_matrix().T", "as_matrix()"),
     Fault("live-pace", "render/live", "side >= max(prompt)", "side > max(prompt)"),
     Fault("motion-fingers", "render/motion", "if name in names:", "if name in names and own.rig.free[j]:"),
+    Fault("orbit-first-pose", "render/subject", "corners_m[:, 0].amin(0) + corners_m[:, 1].amax(0)",
+          "corners_m[0, 0] + corners_m[0, 1]"),
     Fault("render-rate", "render/pictures", "return fps / step", "return fps"),
     Fault("texture-border", "asset/texture", "image[nearest[0], nearest[1]]", "image"),
     Fault("root-median", "asset/staging", "np.median(points_m[..., 1].min(1))", "np.min(points_m[..., 1].min(1))"),

@@ -126,6 +126,18 @@ def test_an_orbit_around_one_pose_has_the_requested_size_and_number_of_images(su
         assert abs((y.min() + y.max()) / 2 - 23.5) < 4
 
 
+def test_an_orbit_looks_at_the_middle_of_all_poses(subject: Path) -> None:
+    """Bodies of 1 x 1 m stand at x = 0 to 1 m, and at 4 to 5 m: all cameras see 2.5 m in the middle of their images."""
+    capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
+    root = torch.eye(4).repeat(2, 1, 1)
+    root[1, 0, 3] = 4.0
+    walked = dataclasses.replace(body, frames=(0, 1), theta=torch.zeros_like(body.theta[:2]), root=root)
+    middle_m = np.array([2.5, 0.5, 1.0])
+    for camera in _cameras(RenderOptions(pictures=3), capture, walked):
+        size_px = np.array(camera.size_px)
+        np.testing.assert_allclose(camera.project(middle_m)[0], (size_px - 1) / 2, atol=1e-3)
+
+
 def test_a_camera_path_without_sizes_takes_the_size_of_the_recording(subject: Path, tmp_path: Path) -> None:
     """Intrinsics of a path are for images as recorded, not as downscaled by ingest."""
     capture = Capture.load(subject / "capture")
