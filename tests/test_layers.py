@@ -43,5 +43,5 @@ def test_a_package_imports_nothing_from_a_layer_above(floor: str) -> None:
 
 @pytest.mark.parametrize("library", ["pycolmap", "warp"])
 def test_a_library_is_imported_in_one_place(library: str) -> None:
-    """Imported directly, pycolmap would report SIGTERM as a crash, and warp would print a banner."""
+    """Imported directly, pycolmap would handle signals, and warp would print a banner."""
     assert [path.name for path in ROOT.rglob("*.py") if library in imported(path)] == [f"{library}_import.py"]
