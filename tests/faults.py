@@ -444,6 +444,7 @@ FAULTS = (
     Fault("store-gc-locked", "tasks/garbage",
           ' if not _is_locked(inventory.store.path(one.stage, one.key, ".lock"))', ""),
     Fault("too-few-gpus", "tasks/training", "if 0 < gpus < settings.processes:", "if False:"),
+    Fault("pycolmap-signals", "pycolmap_import", "libc.sigaction(int(number), action, None)", "pass"),
     Fault("rank-reason", "tasks/launcher", " if line.startswith(REASON)", ""),
     Fault("checkpoint-damage", "training/checkpoint", "archive.testzip()", "None", "training/trainer"),
     Fault("checkpoint-key", "training/checkpoint", 'or state.get("key") != key', "", "training/trainer"),

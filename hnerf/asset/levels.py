@@ -5,10 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pymeshlab
 import trimesh
 
-from hnerf.asset.simplify import collapse_edges
+from hnerf.asset.simplify import collapse_edges, mesh_set
 from hnerf.asset.texture import UvLayout
 
 MOVED_M = 0.002  # vertices that an expression moves farther are decimated least: people look at them
@@ -67,10 +66,8 @@ def _decimated(points_m: np.ndarray, whole: Level, face_count: int, moves: np.nd
     vertex_of_uv = np.zeros(len(uvs), np.int64)
     vertex_of_uv[face_uvs] = whole.faces
     weights = moves[vertex_of_uv].astype(np.float64)
-    cut = pymeshlab.Mesh(points_m[vertex_of_uv], face_uvs, v_scalar_array=weights)
-    cut.add_vertex_custom_scalar_attribute(np.arange(len(uvs), dtype=np.float64), NUMBER)
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(cut)
+    meshes = mesh_set(points_m[vertex_of_uv], face_uvs, v_scalar_array=weights)
+    meshes.current_mesh().add_vertex_custom_scalar_attribute(np.arange(len(uvs), dtype=np.float64), NUMBER)
     collapse_edges(meshes, face_count, onto_ends=True, weighted=bool(np.ptp(weights)))
     meshes.meshing_remove_unreferenced_vertices()
     mesh = meshes.current_mesh()

@@ -8,10 +8,10 @@ there, stiff at first, then more and more pliant: non-rigid iterative closest po
 from dataclasses import dataclass
 
 import numpy as np
-import pymeshlab
 import trimesh
 
 from hnerf.asset.plate import START_M, ThinPlate
+from hnerf.asset.simplify import mesh_set
 from hnerf.body.base_mesh import BaseMesh
 from hnerf.body.descriptor import normals_of
 from hnerf.geometry.mesh_queries import Surface
@@ -54,8 +54,7 @@ def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
 
 def crossing_faces(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return which faces (F,) cross another one, bool."""
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(vertices_m, faces))
+    meshes = mesh_set(vertices_m, faces)
     meshes.compute_selection_by_self_intersections_per_face()
     return meshes.current_mesh().face_selection_array()
 

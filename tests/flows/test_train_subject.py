@@ -3,6 +3,8 @@
 import errno
 import inspect
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
@@ -23,6 +25,16 @@ from tasks import store
 from tasks.stage import Stage
 from tasks.store import Artifact
 
+IN_A_THREAD = """
+import threading
+
+def load():
+    import flows.train_subject
+
+thread = threading.Thread(target=load)
+thread.start()
+thread.join()
+"""
 STAGES = ("ingest", "detect", "find_hands", "calibrate", "segment", "fit", "train", "evaluate", "export")
 
 
@@ -58,6 +70,12 @@ def replace_stages(patch: pytest.MonkeyPatch, names: Iterable[str], write: Calla
 
 def given(subject: Path, stage: str) -> list[str]:
     return json.loads((subject / stage / "given.json").read_text())
+
+
+def test_a_process_that_imports_the_flow_outside_its_main_thread_ends_well() -> None:
+    """Prefect does that after a run was cancelled or crashed, and a worker waits for the end of that process."""
+    ended = subprocess.run([sys.executable, "-c", IN_A_THREAD], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_every_stage_is_linked_and_gets_the_results_of_earlier_stages(folder: Path, tmp_path: Path) -> None:
