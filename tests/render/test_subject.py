@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from flows.cli import main
 from hnerf.avatar.model_file import write_field
