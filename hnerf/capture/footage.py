@@ -25,7 +25,6 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 # Only MP4 and QuickTime, whatever the file's name: other formats, such as playlists, make FFmpeg read further files.
 FORMATS = "format_whitelist;mov"
 PROGRESS_FRAMES = 100  # between two reports
-COMPARED_FRAMES = 8  # of a video, at least, to find out whether its pictures differ
 MIN_FPS, MAX_FPS = 0.01, 10_000.0  # of a recording
 
 
@@ -91,39 +90,37 @@ class Video:
 
     def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
         """Yield the wanted frames in ascending order, turned as the file states, but not mirrored. Raises InputError if
-        one cannot be read."""
+        one cannot be read, or if they all look the same: OpenCV cannot convert interlaced pictures, returns what its
+        memory holds, and reports success."""
         stream, position, inverted = _open_stream(self.path), 0, opencv_inverts(self.path)
-        for frame in sorted(wanted):
+        frames, digests = sorted(wanted), set[int]()
+        for frame in frames:
             while position < frame and stream.grab():
                 position += 1
             ok, bgr = stream.read()
             if not ok:
                 raise InputError(f"{self.path}: frame {frame} cannot be read; export the video again as H.264")
             position += 1
+            digests.add(zlib.crc32(bgr.tobytes()))
             rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
             yield VideoFrame(frame, cv2.rotate(rgb, cv2.ROTATE_180) if inverted else rgb, None)
+        if len(digests) == 1 < len(frames):
+            raise InputError(
+                f"{self.path}: its pictures look the same; if it is interlaced, export it as progressive H.264"
+            )
 
 
 Footage = ImageFolder | Video
 
 
 def _times_s(path: Path, stream: cv2.VideoCapture) -> list[float]:
-    """Decode a video; return when each frame is shown, up to one frame more than the file declares.
-
-    Raises InputError if all its pictures look the same: OpenCV does not report that it cannot convert interlaced ones,
-    and returns whatever its memory holds.
-    """
-    declared, times_s, digests = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), list[float](), list[int]()
+    """Decode a video; return when each frame is shown, up to one frame more than the file declares."""
+    declared, times_s = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), list[float]()
     while len(times_s) <= declared and stream.grab():
-        if len(times_s) % max(1, declared // COMPARED_FRAMES) == 0:
-            ok, picture = stream.retrieve()
-            digests.append(zlib.crc32(picture.tobytes()) if ok else -1)
         times_s.append(stream.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
         if len(times_s) % PROGRESS_FRAMES == 0:
             report(path.name, len(times_s), declared + 1)
     report(path.name, 1, 1)
-    if len(digests) > 1 and len(set(digests)) == 1:
-        raise InputError(f"{path}: all its pictures look the same; if it is interlaced, export it as progressive H.264")
     return times_s
 
 

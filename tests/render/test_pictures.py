@@ -120,7 +120,8 @@ def test_every_kind_of_image_is_also_written_as_a_video(tmp_path: Path) -> None:
     for kind, middle in {"colour": RENDERED, "depth": 255, "normals": towards_camera, "mask": 255}.items():
         video = Video.open(tmp_path / f"{kind}.mp4")
         assert (len(video.frames), video.fps) == (2, 5.0)
-        for picture in video.read([0, 1]):
+        for frame in (0, 1):
+            (picture,) = video.read([frame])
             np.testing.assert_allclose(picture.rgb[31, 31], middle, atol=16, err_msg=kind)
             assert picture.rgb[0, 0].max() < 16  # background
 
