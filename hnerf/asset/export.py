@@ -120,8 +120,8 @@ def export_asset(
     with timed("viewer", seconds, log):
         viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with timed("validation", seconds, log):
-        resampled = [f"avatar_{rate}.usda" for rate in staged.rates]
-        packages = ["avatar.usdz", "avatar.usda", *resampled, "avatar_cache.usdz", *([SPLATS] if splats else [])]
+        interfaces = ["avatar.usda", "avatar_materialx.usda", *(f"avatar_{rate}.usda" for rate in staged.rates)]
+        packages = ["avatar.usdz", *interfaces, "avatar_cache.usdz", *([SPLATS] if splats else [])]
         validation = {name: validate_package(out / name) for name in packages}
     report = _figures(capture, meshes, asset, topology, settings) | {
         "crossing_share": {pose.name: pose.crossing for pose in poses},

@@ -2,9 +2,9 @@
 
 `avatar.usda` is the interface: variant sets, asset information, and payloads that lie in `avatar/`. `avatar_24.usda`
 and `avatar_30.usda` show it at 24 and 30 frames a second, for importers that ignore a file's own rate; without the
-resampled motions, there are none. `avatar.usdz` has the same prims and variants in one layer, as ARKit requires.
-`avatar_cache.usdz` has the surface as points at every frame, and `avatar_splats.usdc` has the splats, if they are
-wanted.
+resampled motions, there are none. `avatar_materialx.usda` adds MaterialX networks to the materials. `avatar.usdz` has
+the prims and variants of `avatar.usda` in one layer, as ARKit requires. `avatar_cache.usdz` has the surface as points
+at every frame, and `avatar_splats.usdc` has the splats, if they are wanted.
 
 A second avatar, of the captured mesh, adds a variant set `topology`. All other variant sets are then inside its
 variants, and the names of payloads and images start with the variant's name.
@@ -23,6 +23,7 @@ import numpy as np
 from pxr import Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from hnerf.asset import usd
+from hnerf.asset.materialx import author_network
 from hnerf.asset.rigs import FULL
 from hnerf.asset.splats import Splats
 from hnerf.asset.staging import CAPTURED, StagedAvatar, box
@@ -61,19 +62,20 @@ class Part:
 
 
 def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
-    """Write `avatar.usda`, the same at each of the avatar's rates (`avatar_24.usda`), and the folder `avatar/` into
-    `out`."""
+    """Write `avatar.usda`, the same at each of the avatar's rates (`avatar_24.usda`) and with MaterialX, and the folder
+    `avatar/` into `out`."""
     folder = out / PAYLOADS
     folder.mkdir()
     _write_images(folder, avatars)
-    parts = _parts(avatars, list(cameras), fps)
-    for part in parts:
+    parts, networks = _parts(avatars, list(cameras), fps), list(_networks(avatars, fps))
+    for part in (*parts, *networks):
         layer = Usd.Stage.CreateNew(str(folder / f"{part.name}.usdc"))
         _set_units(layer, part.fps)
         layer.SetDefaultPrim(layer.OverridePrim(usd.ROOT))
         part.author(layer)
         _save(layer)
     _write_interface(out / INTERFACE, parts, avatars, fps, info, CAPTURED)
+    _write_interface(out / "avatar_materialx.usda", parts + networks, avatars, fps, info, CAPTURED)
     for rate in next(iter(avatars.values())).rates:
         _write_interface(out / f"avatar_{rate}.usda", parts, avatars, rate, info, f"{CAPTURED}_{rate}")
 
@@ -149,6 +151,15 @@ def _parts_of(topology: str, avatar: StagedAvatar, cameras: list[Camera], fps: f
     for name, motion in avatar.rigs[FULL].motions.items():
         author = partial(usd.author_motion, name=name, avatar=avatar)
         yield Part(f"{prefix}motion_{name}", author, motion.fps, ("motion", name), outer)
+
+
+def _networks(avatars: Avatars, fps: float) -> Iterator[Part]:
+    """Yield the MaterialX networks of all looks."""
+    for topology, avatar in avatars.items():
+        prefix = _prefix(topology)
+        for name in avatar.looks:
+            author = partial(author_network, name=name, avatar=avatar, prefix=prefix)
+            yield Part(f"{prefix}materialx_{name}", author, fps, ("look", name), _variant(topology))
 
 
 @contextmanager

@@ -25,6 +25,7 @@ SIGMAS = 3  # from a splat's centre to the end of its box
 APERTURE = 0.36  # film gate width in tenths of a scene unit, read as 36 mm where a unit is a metre
 TEXTURE_NAMES = {"captured": "texture.png", "albedo": "albedo.png"}  # by look
 LIGHT_NAME, NORMAL_MAP_NAME = "light.png", "normal_map.png"
+MATTE = {"roughness": 1.0, "metallic": 0.0, "ior": 1.0}  # no sheen: what there was is already in the colours
 REST_NOTE = (
     f"Rest pose: {REST_POSE}, arms slanting down, elbows and knees a little bent; soles at height 0, facing +Z. The "
     "root joint stands on the ground below the pelvis; it moves over the ground and turns about the vertical with it."
@@ -35,6 +36,11 @@ def surface_path(level: int) -> Sdf.Path:
     """Return the path of the mesh at a level of detail. Each level has its own prim, since rigs have weights for
     each."""
     return BODY.AppendChild(f"Surface_lod{level}" if level else "Surface")
+
+
+def look_path(name: str) -> Sdf.Path:
+    """Return the path of the material of a look."""
+    return ROOT.AppendPath(f"Materials/{name.capitalize()}")
 
 
 def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
@@ -85,7 +91,7 @@ def author_look(
 ) -> None:
     """Define the material of one of the avatar's looks, a matte preview surface with its texture and the normal map,
     and bind meshes to it; for the albedo, also define the recording's light. prefix: of the names of images."""
-    material = UsdShade.Material.Define(stage, ROOT.AppendPath(f"Materials/{name.capitalize()}"))
+    material = UsdShade.Material.Define(stage, look_path(name))
     UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
     reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("TextureCoordinates"))
     reader.CreateIdAttr("UsdPrimvarReader_float2")
@@ -95,9 +101,8 @@ def author_look(
     texture = _define_texture(stage, path, prefix + TEXTURE_NAMES[name], "sRGB", coordinates)
     surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
-    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
-    surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
-    surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(1.0)  # no sheen: what there was is already in the colours
+    for given, value in MATTE.items():
+        surface.CreateInput(given, Sdf.ValueTypeNames.Float).Set(value)
     colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
     if avatar.normal_map is not None:

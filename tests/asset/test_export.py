@@ -66,7 +66,7 @@ FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avat
 FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png", "avatar/normal_map.png"}
 FILES |= {f"avatar/{name}.usdc" for name in ("look_captured", "cameras", "rig_full", "rig_game")}
 FILES |= {"avatar/geometry_lod0.usdc", "avatar/geometry_lod1.usdc", "avatar/shape_stout.usdc"}
-FILES |= {"avatar/shape_captured.usdc"}
+FILES |= {"avatar/shape_captured.usdc", "avatar_materialx.usda", "avatar/materialx_captured.usdc"}
 FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
 
 
@@ -105,7 +105,7 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
     assert report["rigs"]["game"]["influences"] == 2 and report["rigs"]["game"]["moved_max_mm"] < 0.01
     assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}
     assert report["motions"]["captured_30"] == {"fps": 30, "poses": 16}
-    for name in ("avatar.usdz", "avatar.usda"):
+    for name in ("avatar.usdz", "avatar.usda", "avatar_materialx.usda"):
         assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (12, [])
     assert report["against_field"]["images"] == 0 and list(report["crossing_share"]) == ["Frown", "Stout"]
     assert "Extreme poses" in page and "Asset and field" not in page
@@ -150,7 +150,7 @@ def test_files_at_other_rates_are_left_out_if_poses_are_far_apart(
     report = export_asset(slow, Masks({}, {}), StandInAvatar(bending_body()), tiny, tmp_path)
     assert list(report["motions"]) == ["captured"]
     assert not {"avatar_24.usda", "avatar_30.usda", "avatar.bvh"} & set(report["bytes"])
-    assert set(report["validation"]) == {"avatar.usda", "avatar.usdz", "avatar_cache.usdz"}
+    assert set(report["validation"]) == {"avatar.usda", "avatar_materialx.usda", "avatar.usdz", "avatar_cache.usdz"}
     assert [r.message for r in caplog.records if "avatar.bvh" in r.message] == [
         "column: no avatar_24.usda, avatar_30.usda and avatar.bvh: the captured poses are too far apart to be "
         "interpolated; list more frames in capture.toml"

@@ -233,8 +233,8 @@ def test_packing_an_avatar_again_later_gives_identical_bytes_and_no_output(
     write_all(tmp_path, staged)
     assert capfd.readouterr() == ("", "")
     written = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
-    # Interfaces, images, shapes, levels of detail, cameras, looks, rigs, motions, .usdz.
-    assert len(written) == 3 + 4 + 2 + 2 + 1 + 2 + 2 + 3 + 2
+    # Interfaces, images, shapes, levels of detail, cameras, looks, MaterialX, rigs, motions, .usdz.
+    assert len(written) == 4 + 4 + 2 + 2 + 1 + 2 + 2 + 2 + 3 + 2
     for path in written:
         assert path.read_bytes() == (package / path.relative_to(tmp_path)).read_bytes(), path.name
     with ZipFile(tmp_path / "avatar.usdz") as archive:
