@@ -258,6 +258,8 @@ def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument("subject", type=path, help=FOLDERS["subject"])
     what = f"add this motion: {MOTIONS}"
     export.add_argument("--motion", type=path, action="append", default=[], metavar="FILE", help=what)
+    what = "add FBX and Alembic; PROGRAM is Blender, or a Python that has bpy"
+    export.add_argument("--blender", metavar="PROGRAM", help=what)
     what = "accept an asset that is more than 4 dB below its field"
     export.add_argument("--allow-poor", action="store_true", help=what)
     _add_out(export, "asset")

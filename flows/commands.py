@@ -272,7 +272,7 @@ def export(options: argparse.Namespace) -> None:
     allowed = ["asset.allow_poor=true"] if options.allow_poor else []
     settings = load_settings(options.preset, options.overrides + allowed).asset
     digest = recording_digest(options.subject)
-    report = export_subject(options.subject, settings, options.motion, options.out, digest)
+    report = export_subject(options.subject, settings, options.motion, options.out, digest, options.blender)
     motions = ", ".join(f"{name} ({m['poses']} poses)" for name, m in report["motions"].items())
     print(f"motions: {motions}\nasset: {options.out / 'avatar.usda'}")
 

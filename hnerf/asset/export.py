@@ -14,6 +14,7 @@ import trimesh
 from threadpoolctl import threadpool_limits
 
 from hnerf.asset.baking import baked_textures
+from hnerf.asset.blender import write_with_blender
 from hnerf.asset.bvh_file import write_avatar_bvh
 from hnerf.asset.comparison import Compared, compare_with_field, comparison_figures, require_close
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
@@ -90,12 +91,14 @@ def export_asset(
     out: Path,
     digest: str = "",
     further: Mapping[str, Motion] | None = None,
+    blender: str | None = None,
 ) -> dict[str, Any]:
     """Write the files that docs/asset.md lists into `out`; return the content of `report.json`.
 
-    digest: of the recording, for the asset's information; further: motions of other bodies to add, by name. Raises
-    InputError if the field has no surface or a motion lacks a joint, and InvalidAsset if a package fails validation or
-    the asset is far below its field (`require_close`).
+    digest: of the recording, for the asset's information; further: motions of other bodies to add, by name; blender:
+    program that adds FBX and Alembic (`write_with_blender`). Raises InputError if the field has no surface, a motion
+    lacks a joint, or that program fails, and InvalidAsset if a package fails validation or the asset is far below its
+    field (`require_close`).
     """
     seconds: dict[str, float] = {}
     own = avatar.without_frames().body.to("cpu")  # the unclothed body, to which further motions are retargeted
@@ -123,6 +126,9 @@ def export_asset(
         interfaces = ["avatar.usda", "avatar_materialx.usda", *(f"avatar_{rate}.usda" for rate in staged.rates)]
         packages = ["avatar.usdz", *interfaces, "avatar_cache.usdz", *([SPLATS] if splats else [])]
         validation = {name: validate_package(out / name) for name in packages}
+    if blender:
+        with timed("blender", seconds, log):
+            write_with_blender(out, blender, capture.fps)
     report = _figures(capture, meshes, asset, topology, settings) | {
         "crossing_share": {pose.name: pose.crossing for pose in poses},
         "viewer": viewer,

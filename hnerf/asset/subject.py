@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from hnerf.asset.blender import require_blender
 from hnerf.asset.export import export_asset
 from hnerf.asset.staging import CAPTURED
 from hnerf.avatar.finished import avatar_of, readable, recording_of, require_files, require_poses
@@ -19,21 +20,29 @@ LONGEST_NAME = 200  # of a motion; its payload's name is longer, and file system
 
 
 def export_subject(
-    subject: Path, settings: AssetSettings, motions: Iterable[Path], out: Path, digest: str
+    subject: Path,
+    settings: AssetSettings,
+    motions: Iterable[Path],
+    out: Path,
+    digest: str,
+    blender: str | None = None,
 ) -> dict[str, Any]:
     """Export a subject (<store>/subjects/<name>) into the new folder `out`; return the report of `export_asset`.
 
-    motions: files or subjects to add (`read_motion`), named after their files; digest: of the recording. Raises
-    InputError if a file is missing, a motion cannot be read, or its name is already in use.
+    motions: files or subjects to add (`read_motion`), named after their files; digest: of the recording; blender:
+    program that adds FBX and Alembic. Raises InputError if a file is missing, a motion cannot be read, its name is
+    already in use, or that program cannot be used.
     """
     with atomic_folder(out) as partial:
+        if blender:
+            require_blender(blender)
         require_files(subject, NEEDED)
         require_poses(subject, "an asset")
         further = _named(motions)
         capture, avatar = recording_of(subject), avatar_of(subject)
         with readable(subject / "segmentation"):
             masks = Masks.load(subject / "segmentation")
-        return export_asset(capture, masks, avatar, settings, partial, digest, further)
+        return export_asset(capture, masks, avatar, settings, partial, digest, further, blender)
 
 
 def _named(motions: Iterable[Path]) -> dict[str, Motion]:

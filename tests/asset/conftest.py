@@ -88,3 +88,11 @@ def both(staged: StagedAvatar, captured: StagedAvatar, tmp_path_factory: pytest.
     write_package(out, {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
     write_usdz(out / "avatar.usdz", {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
     return out
+
+
+@pytest.fixture
+def small_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make reports with few and small images, and without a viewer, because the capture has no pixels."""
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
+    monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
+    monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))

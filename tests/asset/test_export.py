@@ -26,14 +26,6 @@ SMALL = AssetSettings(
 TINY = SMALL.model_copy(update={"grid_cells": 32, "texture_px": 32, "faces": 500, "correctives": 0})
 
 
-@pytest.fixture
-def small_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make reports with few and small images, and without a viewer, because the capture has no pixels."""
-    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
-    monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
-    monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))
-
-
 class Swelling(StandInAvatar):
     """An avatar whose clothes stand 2, 4, 6 and 12 mm farther out in frames 3, 4, 5 and 8 than without frames, because
     the upper bone bends by 0.1 rad a frame."""

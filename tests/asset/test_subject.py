@@ -6,10 +6,14 @@ import pytest
 
 from hnerf.asset import subject as exported
 from hnerf.asset.subject import export_subject
+from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings, load_settings
 from hnerf.errors import InputError
 from hnerf.render.motion import Motion
-from tests.asset.figure import bending_body
+from tests.asset.figure import bending_body, capture
+from tests.asset.stand_in import StandInAvatar
+from tests.asset.test_blender import write_program
+from tests.asset.test_export import TINY
 
 
 def made(folder: Path) -> Path:
@@ -75,3 +79,33 @@ def test_damaged_masks_are_reported_by_name(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(InputError, match=r"ada/segmentation: damaged, or written by another version \("):
         export_subject(made(tmp_path / "ada"), AssetSettings(), [], tmp_path / "out", "")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_blender_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exported, "recording_of", lambda subject: pytest.fail("the subject was read"))
+    with pytest.raises(InputError, match="absent: no such program"):
+        export_subject(made(tmp_path / "ada"), AssetSettings(), [], tmp_path / "out", "", "absent")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("small_report")
+@pytest.mark.parametrize("fails", [False, True])
+def test_blender_adds_its_files_or_nothing_is_written(
+    fails: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stand-in is asked first without a frame rate whether it can; then it gets the capture's, 10."""
+    monkeypatch.setattr(exported, "recording_of", lambda subject: capture())
+    monkeypatch.setattr(exported, "avatar_of", lambda subject: StandInAvatar(bending_body()))
+    monkeypatch.setattr(exported.Masks, "load", lambda folder: Masks({}, {}))
+    write = f"test -s avatar.usdz && printf %s $3 > avatar.fbx && echo points > avatar_cache.abc && exit {int(fails)}"
+    program = write_program(tmp_path / "python", f'shift; test "$2" = -- || exit 3; test $# = 2 || {{ {write}; }}')
+    subject, before = made(tmp_path / "ada"), sorted(tmp_path.iterdir())
+    if fails:
+        with pytest.raises(InputError, match="python: exit code 1"):
+            export_subject(subject, TINY, [], tmp_path / "out", "", program)
+        assert sorted(tmp_path.iterdir()) == before
+    else:
+        report = export_subject(subject, TINY, [], tmp_path / "out", "", program)
+        assert (tmp_path / "out" / "avatar.fbx").read_text() == "10.0"
+        assert report["bytes"]["avatar.fbx"] == 4 and report["bytes"]["avatar_cache.abc"] == 7
+        assert "blender" in report["seconds"]
