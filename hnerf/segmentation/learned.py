@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from hnerf.errors import InputError
+from hnerf.onnx_session import open_session, outputs_of
 
 TOLERANCE = 1e-3  # a probability may be outside [0, 1] by this much
 
@@ -20,19 +21,7 @@ class Network:
     def __init__(self, path: Path) -> None:
         """Load a network. Raises InputError if the file or ONNX Runtime is missing, or if the file is no such
         network."""
-        if not path.is_file():
-            raise InputError(f"segmentation.model: {path}: no such file; name an ONNX file, or leave it out")
-        try:
-            import onnxruntime
-        except ImportError:
-            raise InputError(
-                f"segmentation.model: {path}: needs ONNX Runtime; install '.[learned]', or leave it out"
-            ) from None
-        self.path = path
-        try:
-            self.session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-        except Exception as error:  # ONNX Runtime's own exceptions have no common base
-            raise InputError(f"{path}: not a network that ONNX Runtime can run: {error}") from None
+        self.path, self.session = path, open_session(path, "segmentation.model")
         inputs = self.session.get_inputs()
         shape = inputs[0].shape
         if len(inputs) != 1 or len(shape) != 4 or 3 not in (shape[1], shape[3]) or inputs[0].type != "tensor(float)":
@@ -48,11 +37,7 @@ class Network:
         values = pixels.astype(np.float32)[None] / 255
         if self.channels_first:
             values = np.ascontiguousarray(values.transpose(0, 3, 1, 2))
-        try:
-            outputs = self.session.run(None, {self.session.get_inputs()[0].name: values})
-        except Exception as error:  # as above
-            reason = " ".join(str(error).split())
-            raise InputError(f"{self.path}: does not run on {values.shape}: {reason}; export it for any size") from None
+        outputs = outputs_of(self.session, self.path, values, "export it for any size")
         found = np.squeeze(outputs[0])
         if found.ndim != 2 or not (found.min() >= -TOLERANCE and found.max() <= 1 + TOLERANCE):
             raise InputError(
