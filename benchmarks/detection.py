@@ -69,23 +69,24 @@ def measure(folder: Path, scratch: Path) -> dict[str, Any]:
     figures = {DELIVERED: score(folder, capture)}
     for size in SIZES:
         out = scratch / size
-        detect(capture, DetectionSettings.model_validate({"source": "network", "size": size}), out)
+        settings = DetectionSettings.model_validate({"source": "network", "size": size})
+        detect(capture, settings, out)
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:
-            cost = alone.submit(cost_of_a_frame, capture, size, scratch / f"{size}-cost").result()
+            cost = alone.submit(cost_of_a_frame, capture, settings, scratch / f"{size}-cost").result()
         figures[size] = score(folder, Capture.load(out)) | cost
     return figures
 
 
-def cost_of_a_frame(capture: Capture, size: str, out: Path) -> dict[str, float]:
+def cost_of_a_frame(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str, float]:
     """Return the milliseconds of one core's time for a frame of the first camera, without the first frame, and the peak
     memory of this process, which must be a new one."""
     camera = capture.train_cameras[0]
     one = dataclasses.replace(capture, train_frames=capture.frames[:1], novel_pose_frames=())
-    find_in_camera(one, camera, size, out / "warm")
+    find_in_camera(one, camera, settings, out / "warm")
     times = []
     for looked_at in (one, capture):
         started = time.process_time()
-        find_in_camera(looked_at, camera, size, out / str(len(looked_at.frames)))
+        find_in_camera(looked_at, camera, settings, out / str(len(looked_at.frames)))
         times.append(time.process_time() - started)
     ms = 1e3 * (times[1] - times[0]) / (len(capture.frames) - 1)
     return {"ms": round(ms, 1), "mib": peak_mib()}

@@ -65,8 +65,10 @@ class SyntheticSettings(Section):
 
 
 class DetectionSettings(Section):
+    excluded_from_key: ClassVar[tuple[str, ...]] = ("hands",)  # a stage of their own
     source: Literal["recording", "network", "both"] | None = None  # null: see docs/formats.md, From a network
     size: Literal["heavy", "full", "lite"] = "heavy"  # of the landmark network
+    model: Path | None = None  # ONNX keypoint network; its keypoints replace those of the landmark network
     hands: Literal["auto", "none"] = "auto"  # auto: find the hands if the networks are installed; 0.04 s per image
 
 

@@ -8,6 +8,7 @@ import time
 import zlib
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from itertools import tee
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -21,6 +22,7 @@ from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.subject import ranked_people
 from hnerf.capture.subset import write_points
 from hnerf.config import DetectionSettings
+from hnerf.detection.keypoint_network import KeypointNetwork
 from hnerf.detection.landmarks import POINTS, SIZE, LandmarkNetwork, Person
 from hnerf.detection.merge import fill_missing
 from hnerf.detection.people import PICTURE, REPORT, check_subject, draw_people, keep_subject, people_rows
@@ -48,15 +50,18 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     """
     for name in (POSE_DETECTOR, f"pose_landmark_{settings.size}.tflite"):
         model_file(name)
-    ms = _find_people(capture, settings.size, out)
+    network = None if settings.model is None else KeypointNetwork(settings.model)
+    ms = _find_people(capture, settings, out)
     found = {name: _load(out, name, "points_px") for name in capture.train_cameras}
+    people = to_body_25({name: people["points_px"] for name, people in found.items()}, "blazepose_33")
+    if network is not None:
+        people = network.body_25({name: _load(out, name, "own_px")["own_px"] for name in people}, people)
     alone = settings.source == "network" or not capture.has_keypoints
-    if alone and not any((people["points_px"][..., 2] > 0).any() for people in found.values()):
+    if alone and not any((points[..., 2] > 0).any() for points in people.values()):
         raise InputError(
             f"{capture.name}: nobody found in any image of the training cameras; a person must be seen from head to "
             "feet, upright, and be no smaller than a tenth of the image"
         )
-    people = to_body_25({name: people["points_px"] for name, people in found.items()}, "blazepose_33")
     for name, points in people.items():  # keypoints that the network guesses outside the image count as not seen
         points *= capture.cameras[name].holds(points[..., :2])[..., None]
     copy_folder(capture.root, out)
@@ -92,16 +97,16 @@ def _with_own(capture: Capture, people: dict[str, np.ndarray]) -> dict[str, np.n
     return people | own | filled
 
 
-def _find_people(capture: Capture, size: str, out: Path) -> dict[str, float]:
+def _find_people(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str, float]:
     """Run `find_in_camera` for each camera without complete landmarks in `out`; return its results by camera."""
     waiting = [name for name in capture.train_cameras if not _is_whole(out / LANDMARKS / f"{name}.npz")]
     if len(waiting) < 2:
-        return {name: find_in_camera(capture, name, size, out) for name in waiting}
+        return {name: find_in_camera(capture, name, settings, out) for name in waiting}
     processes = min(len(waiting), len(os.sched_getaffinity(0)))
     spawn = multiprocessing.get_context("spawn")
     ends = (signal.SIGKILL, os.getpid())
     with ProcessPoolExecutor(processes, spawn, initializer=end_with_parent, initargs=ends) as pool:
-        jobs = {pool.submit(find_in_camera, capture, name, size, out): name for name in waiting}
+        jobs = {pool.submit(find_in_camera, capture, name, settings, out): name for name in waiting}
         running = set(jobs)
         try:
             while running:
@@ -117,17 +122,23 @@ def _find_people(capture: Capture, size: str, out: Path) -> dict[str, float]:
     return {name: job.result() for job, name in jobs.items()}
 
 
-def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> float:
+def find_in_camera(capture: Capture, camera: str, settings: DetectionSettings, out: Path) -> float:
     """Write one camera's masks, and then, atomically, `landmarks/<camera>.npz`; return the milliseconds per image.
 
     The file holds `points_px` (frames, people, 33, 3): x, y, confidence; `points_m` (frames, people, 33, 3); `masks`
-    (frames, people, 256, 256) uint8 in `regions` (frames, people, 4): centre x and y, side, angle.
+    (frames, people, 256, 256) uint8 in `regions` (frames, people, 4): centre x and y, side, angle. With a keypoint
+    network of the user's own also `own_px` (frames, people, K, 3), its points.
     """
     cv2.setNumThreads(1)
     started = time.perf_counter()
-    images = (capture.image(camera, frame) for frame in tracked(capture.frames, "detection", len(capture.frames)))
-    everybody = []
-    for frame, people in zip(capture.frames, track(images, PersonDetector(), LandmarkNetwork(size)), strict=True):
+    network = None if settings.model is None else KeypointNetwork(settings.model)
+    frames = tracked(capture.frames, "detection", len(capture.frames))
+    images, again = tee(capture.image(camera, frame) for frame in frames)
+    found = track(images, PersonDetector(), LandmarkNetwork(settings.size))
+    everybody, own = [], []
+    for frame, image, people in zip(capture.frames, again, found, strict=True):
+        if network is not None:
+            own.append(np.array([network(image, person) for person in people]).reshape(-1, network.points, 3))
         write_image(out / PERSON / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))
         everybody.append([person._replace(mask=to_8_bit(person.mask)) for person in people])
     path = out / LANDMARKS / f"{camera}.npz"
@@ -140,6 +151,7 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> float
             points_m=_by_frame(everybody, lambda person: person.points_m, (POINTS, 3)),
             masks=_by_frame(everybody, lambda person: person.mask, (SIZE, SIZE), np.uint8),
             regions=_by_frame(everybody, lambda person: np.array([*person.region.centre_px, *person.region[1:]]), (4,)),
+            **({} if network is None else {"own_px": pad_people(own)}),  # type: ignore[arg-type]
         )
     os.sync()  # the masks as well: this file's existence means that they are complete
     os.replace(beside, path)

@@ -8,10 +8,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from hnerf.config import DetectionSettings
 from hnerf.detection import detect
 
 
-def never(capture: Any, camera: str, size: str, out: Path) -> None:
+def never(capture: Any, camera: str, settings: DetectionSettings, out: Path) -> None:
     """Create a file named after the process id, then sleep."""
     (out / str(os.getpid())).touch()
     time.sleep(100)
@@ -21,4 +22,4 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # background processes of a shell ignore SIGINT
     detect.find_in_camera = never
     cameras: Any = SimpleNamespace(train_cameras=("01", "02"), frames=(0,))
-    detect._find_people(cameras, "lite", Path(sys.argv[1]))
+    detect._find_people(cameras, DetectionSettings(), Path(sys.argv[1]))

@@ -16,50 +16,16 @@ from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, DetectionSettings
 from hnerf.detection import detect as module
-from hnerf.detection import people
 from hnerf.detection.detect import detect
-from hnerf.detection.landmarks import Person
-from hnerf.detection.region import Region
 from hnerf.errors import InputError
 from hnerf.models import SHA256, has_model
 from tests.calibration.synthetic import edited_keypoints
 from tests.capture.recordings import write_easymocap
+from tests.detection.made_up import MadeUp
 from tests.shared_data import shared_capture
 
 NETWORK, BOTH = DetectionSettings(source="network"), DetectionSettings(source="both")
 LIMBS = [2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14]
-
-
-class MadeUp:
-    """A network that sees one person with all points at (5, 4), except the right toe (32), which is outside the
-    image."""
-
-    seen = 0
-
-    def __init__(self, *_: str) -> None: ...
-
-    def __call__(self, image: np.ndarray, region: Region | None = None) -> list[Region] | Person:
-        place = Region(np.array([5.0, 4.0]), 8.0, 0.0)
-        if region is None:
-            return [place]
-        MadeUp.seen += 1
-        points = np.tile([5.0, 4.0, 0.5], (33, 1))
-        points[32] = 30, 4, 0.5
-        return Person(points, np.zeros((33, 3)), np.ones((256, 256), np.float32), region, place)
-
-
-@pytest.fixture
-def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Capture:
-    """Return a capture with one training camera, 24 x 16 px, five frames and its own keypoints of confidence .5;
-    replace the networks by made-up ones."""
-    for name in ("PersonDetector", "LandmarkNetwork"):
-        monkeypatch.setattr(module, name, MadeUp)
-    monkeypatch.setattr(module, "model_file", lambda name: None)
-    monkeypatch.setattr(people, "MIN_HEIGHT_PX", 0)
-    MadeUp.seen = 0
-    folder = write_easymocap(tmp_path / "folder")
-    (folder / "capture.toml").write_text('[cameras]\ntrain = ["01"]\ntest = ["02"]\n')
-    return ingest(folder, CaptureSettings(), tmp_path / "capture")
 
 
 def test_keypoints_come_from_the_network_and_the_rest_from_the_recording(recording: Capture, tmp_path: Path) -> None:

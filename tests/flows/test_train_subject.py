@@ -50,7 +50,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         Capture("ada", out, {"1": camera}, ("1",), (), (0,), (), 25.0, "z", {"1": (4, 4)}, {"1": (4, 4)}).save()
         return {}
 
-    replace_stages(monkeypatch, STAGES, write)
+    replace_stages(monkeypatch, (*STAGES, "detect_by_model"), write)
     monkeypatch.setattr(preparation, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
     monkeypatch.setattr(preparation, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
     monkeypatch.setattr(preparation, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
@@ -141,6 +141,18 @@ def test_later_stages_get_the_detections_in_place_of_the_recording(
     assert given(subject, "calibration") == [stage]
     assert given(subject, "training") == [stage, "calibration", "segmentation", "fit"]
     assert given(subject, "asset") == [stage, "calibration", "segmentation", "training"]
+
+
+def test_a_keypoint_network_of_the_users_own_counts_by_its_bytes(folder: Path, tmp_path: Path) -> None:
+    (folder / "undetected").touch()
+    made = []
+    for name, content in (("a.onnx", "one"), ("b.onnx", "one"), ("c.onnx", "two")):
+        (tmp_path / name).write_text(content)
+        subject = train_subject.fn(folder, "demo", tmp_path / "store", [f"detection.model={tmp_path / name}"]).subject
+        assert given(subject, "calibration") == ["detection"]
+        made.append((subject / "detection").resolve())
+    made.append((train_subject.fn(folder, "demo", tmp_path / "store", []).subject / "detection").resolve())
+    assert made[0] == made[1] and len(set(made)) == 3
 
 
 def test_stages_that_a_run_skips_are_not_linked(folder: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from prefect.states import Failed
 
 from hnerf.config import (
     CaptureSettings,
+    DetectionSettings,
     EvaluationSettings,
     FitSettings,
     Section,
@@ -70,6 +71,7 @@ def test_settings_that_do_not_affect_the_result_do_not_count() -> None:
         (TrainingSettings(), TrainingSettings(memory_gib=8, processes=2)),
         (EvaluationSettings(), EvaluationSettings(holdout="each")),
         (SegmentationSettings(), SegmentationSettings(rounds=9, still_px=1)),
+        (DetectionSettings(), DetectionSettings(hands="none")),
     ):
         assert key(settings=one) == key(settings=other) and one != other
     assert key(settings=TrainingSettings()) != key(settings=TrainingSettings(steps=2))
