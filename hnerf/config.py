@@ -311,6 +311,7 @@ class AssetSettings(Section):
     normal_map_px: int = Field(default=0, ge=0, le=8192)  # side of the normal map; 0: none, since it shows grid cells
     correctives: int = Field(default=16, ge=0, le=64)  # blend shapes for what skinning leaves out; 0: none
     bones: Literal["along", "identity"] = "along"  # joint axes at rest: Y along the bone, or the stage's
+    joint_names: Literal["own", "ue5", "mixamo", "humanik", "vrm", "smplx"] = "own"  # whose names joints have in files
     splats: int = Field(default=0, ge=0, le=1_000_000)  # number of Gaussian splats; 0: no splat files
     allow_poor: bool = False  # accept an asset that is more than 4 dB below its field
     version: str = "1"  # version in the asset's assetInfo

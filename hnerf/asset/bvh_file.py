@@ -1,4 +1,5 @@
-"""The captured motion as a BVH file. Joints have their Mixamo names where Mixamo has an equivalent."""
+"""The captured motion as a BVH file. Unless the asset names its joints after another skeleton, they have their Mixamo
+names, without the prefix, where Mixamo has an equivalent."""
 
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 from hnerf.asset.rigs import GAME
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
 from hnerf.body.bvh import Bvh, write_bvh
-from hnerf.body.skeletons import EQUIVALENTS
+from hnerf.body.skeletons import OWN, name_in
 
 CENTIMETRES = 100  # per metre; MotionBuilder and Maya read BVH files in centimetres
 RATE = RATES[-1]
@@ -27,5 +28,7 @@ def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
     offsets[0] = 0  # some programs add the root's offset to its position channels, others ignore it
     positions = np.tile(offsets, (len(stage), 1, 1))
     positions[:, 0] = CENTIMETRES * stage[:, 0, :3, 3]
-    names = tuple((name in EQUIVALENTS and EQUIVALENTS[name].mixamo) or name for name in skeleton.names[1:])
+    own = avatar.joint_names == OWN
+    named_as = "mixamo" if own else avatar.joint_names
+    names = tuple(name_in(named_as, name, prefixed=not own) for name in skeleton.names[1:])
     write_bvh(path, Bvh(names, parents, offsets, 1 / RATE, positions, local))

@@ -200,6 +200,7 @@ def _mesh_asset(
             level_faces=settings.level_faces,
             expressions_m=mesh.face_units_m,
             physiques_m=mesh.physiques_m,
+            joint_names=settings.joint_names,
         )
     splats = surface_splats(staged, settings.splats) if settings.splats else None
     with timed("comparison", seconds, log):

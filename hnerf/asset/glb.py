@@ -16,6 +16,7 @@ from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar, moved_points
 from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
+from hnerf.body.skeletons import JointNames, name_in
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
 RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # left out: glTF times are in seconds
@@ -76,7 +77,7 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     node J; time 0 is a motion's first instant. Mesh and skin are named as in USD; Blender shows these names."""
     writer = GlbWriter()
     document = writer.document
-    _add_joints(document, rig.skeleton)
+    _add_joints(document, rig.skeleton, avatar.joint_names)
     names = [*avatar.blend_shapes_m, *avatar.physiques_m]
     primitive = _primitive(writer, avatar, rig.skin)
     _add_materials(writer, avatar, primitive)
@@ -99,13 +100,14 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     writer.save(path)
 
 
-def _add_joints(document: gltf.GLTF2, skeleton: Skeleton) -> None:
+def _add_joints(document: gltf.GLTF2, skeleton: Skeleton, names: JointNames) -> None:
     local = skeleton.local(skeleton.bind)
     quaternions = Rotation.from_matrix(local[:, :3, :3]).as_quat()
     for joint, name in enumerate(skeleton.names):
         place, turn = local[joint, :3, 3].tolist(), quaternions[joint].tolist()
         below = np.nonzero(skeleton.parents == joint)[0].tolist()
-        document.nodes.append(gltf.Node(name=name, translation=place, rotation=turn, children=below))
+        called = name_in(names, name, prefixed=True)
+        document.nodes.append(gltf.Node(name=called, translation=place, rotation=turn, children=below))
 
 
 def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Primitive:

@@ -146,7 +146,7 @@ def _parts_of(topology: str, avatar: StagedAvatar, cameras: list[Camera], fps: f
     author = partial(usd.author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
     yield Part(f"{prefix}cameras", author, fps, None, outer)
     for name, rig in avatar.rigs.items():
-        author = partial(usd.author_rig, name=name, rig=rig, levels=avatar.levels)
+        author = partial(usd.author_rig, name=name, rig=rig, avatar=avatar)
         yield Part(f"{prefix}rig_{name}", author, fps, ("rig", name), outer)
     for name, motion in avatar.rigs[FULL].motions.items():
         author = partial(usd.author_motion, name=name, avatar=avatar)

@@ -5,7 +5,7 @@ from pxr import Tf, Usd, UsdGeom, UsdSkel
 
 from hnerf.asset.rigs import GAME, GAME_INFLUENCES
 from hnerf.asset.staging import CAPTURED, RATES, box
-from hnerf.body.skeletons import PELVIS, ROOT
+from hnerf.body.skeletons import OWN, PELVIS, ROOT
 
 SAME = 1e-4  # metres, or parts of 1, by which values that must agree may differ
 ON_GROUND_M = 1e-3  # height by which the captured body's lowest point may be off the ground
@@ -32,7 +32,8 @@ def skin_defects(prim: Usd.Prim) -> list[str]:
     # Negated conditions, so that NaN fails.
     if not ((weights >= 0).all() and (np.abs(weights.reshape(vertices, influences).sum(1) - 1) < 1e-4).all()):
         defects.append(f"{name}: joint weights are negative, not finite, or do not sum to 1")
-    used = {tokens[j].rpartition("/")[2] for j in np.unique(joints[weights > 0]).tolist()}
+    own = _own_names(skeleton)
+    used = {own[j] for j in np.unique(joints[weights > 0]).tolist()}
     if len(used & {"eye_L", "eye_R"}) == 1:
         defects.append(f"{name}: skin follows one eye and not the other")
     stage = prim.GetStage()
@@ -51,9 +52,9 @@ def _eyes_off(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, skele
     """Return the names of the eyes whose joints are off the centre of the points (V, 3) that follow them. joints,
     weights (V, K)."""
     off = []
-    tokens, binds = skeleton.GetJointsAttr().Get(), skeleton.GetBindTransformsAttr().Get()
-    for j, (token, bind) in enumerate(zip(tokens, binds, strict=False)):  # `skeleton_defects` compares their numbers
-        name = token.rpartition("/")[2]
+    binds = skeleton.GetBindTransformsAttr().Get()
+    names = _own_names(skeleton)
+    for j, (name, bind) in enumerate(zip(names, binds, strict=False)):  # `skeleton_defects` compares their numbers
         if name.startswith("eye_") and len(ball := points[((joints == j) & (weights > 0)).any(1)]):
             low, high = box(ball)
             if np.linalg.norm(bind.ExtractTranslation() - (low + high) / 2) > EYE_OFF * (high - low).min() / 2:
@@ -78,6 +79,12 @@ def _shape_defects(prim: Usd.Prim, vertices: int) -> list[str]:
         if len(points) and not 0 <= points.min() <= points.max() < vertices:
             return [f"{target}: point index out of range"]
     return []
+
+
+def _own_names(skeleton: UsdSkel.Skeleton) -> list[str]:
+    """Return the exported names of a skeleton's joints, whichever names they have in the file."""
+    own = (skeleton.GetPrim().GetCustomDataByKey("jointNamesIn") or {}).get(OWN, {})
+    return [own.get(name, name) for name in (joint.rpartition("/")[2] for joint in skeleton.GetJointsAttr().Get())]
 
 
 def skeleton_defects(skeleton: UsdSkel.Skeleton) -> list[str]:
@@ -106,10 +113,11 @@ def _rest_defects(skeleton: UsdSkel.Skeleton, joints: list[str], rest: np.ndarra
     composed = [rest[j] @ bind[p] if p >= 0 else rest[j] for j, p in enumerate(above)]
     if np.abs(np.array(composed) - bind).max() > SAME:
         defects.append(f"{name}: restTransforms do not compose to bindTransforms")
-    pelvis = f"{ROOT}/{PELVIS}"
-    if joints[0] != ROOT or pelvis not in joints or np.abs(bind[0] - np.eye(4)).max() > SAME:
+    names = _own_names(skeleton)
+    pelvis = names.index(PELVIS) if PELVIS in names else 0
+    if names[0] != ROOT or above[pelvis] != 0 or np.abs(bind[0] - np.eye(4)).max() > SAME:
         defects.append(f"{name}: no {ROOT} on the ground with a {PELVIS} below it")
-    elif np.abs(bind[joints.index(pelvis), 3, [0, 2]]).max() > SAME:
+    elif np.abs(bind[pelvis, 3, [0, 2]]).max() > SAME:
         defects.append(f"{name}: {ROOT} does not stand below {PELVIS} at rest")
     if not skeleton.GetPrim().GetCustomDataByKey("restPose"):
         defects.append(f"{name}: does not name its rest pose")

@@ -15,6 +15,7 @@ from hnerf.asset.skeleton import Bones
 from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
+from hnerf.body.skeletons import OWN, JointNames
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP, y_up_from
 from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
@@ -36,7 +37,8 @@ class StagedAvatar:
     "full", with all joints of the body model, and "game", with few joints and influences. frames (n,): of the capture;
     points_m (n, V, 3) float32: the surface in each frame. extents_m (n, 2, 3), by motion: the box at each time code.
     texture (H, W, 3) uint8 sRGB. stage_from_world (3, 3): a rotation. albedo, with its light in the stage, and
-    normal_map (S, S, 3) uint8, in tangent space, if there are any.
+    normal_map (S, S, 3) uint8, in tangent space, if there are any. joint_names: the skeleton after which files name the
+    joints; the rigs have their own names.
     """
 
     rest_points_m: np.ndarray
@@ -52,6 +54,7 @@ class StagedAvatar:
     stage_from_world: np.ndarray
     albedo: Albedo | None = None
     normal_map: np.ndarray | None = None
+    joint_names: JointNames = OWN
 
     @property
     def rates(self) -> tuple[int, ...]:
@@ -127,6 +130,7 @@ def stage_avatar(
     level_faces: Sequence[int] = (),
     expressions_m: Mapping[str, np.ndarray] | None = None,
     physiques_m: Mapping[str, np.ndarray] | None = None,
+    joint_names: JointNames = OWN,
 ) -> StagedAvatar:
     """Turn a clothed body (see `clothed_rig`) and its motion to Y up, with both rigs. surfaces_m (n, V, 3): its surface
     in each frame; `up`: the vertical axis of the world, "y" or "z"; fps: of the frames; further: motions of the same
@@ -155,6 +159,7 @@ def stage_avatar(
         stage_from_world=world,
         albedo=None if albedo is None else Albedo(albedo.texture, albedo.light.turned(world)),
         normal_map=normal_map,
+        joint_names=joint_names,
     )
 
 

@@ -3,19 +3,18 @@
 Y up, metres. Matrices are transposed when they are written (USD uses row vectors).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, UsdVol, Vt
 
-from hnerf.asset.levels import Level
 from hnerf.asset.quads import polygon_corners
 from hnerf.asset.rigs import FULL, StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import CAPTURED, REST_POSE, StagedAvatar, box, moved_points, opengl_pose, shape_names
-from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
+from hnerf.body.skeletons import EQUIVALENTS, OWN, SKELETONS, JointNames, name_in
 from hnerf.geometry.camera import Camera
 
 ROOT = Sdf.Path("/Avatar")
@@ -135,19 +134,20 @@ def _define_texture(
     return texture
 
 
-def author_rig(stage: Usd.Stage, name: str, rig: StagedRig, levels: Sequence[Level]) -> None:
+def author_rig(stage: Usd.Stage, name: str, rig: StagedRig, avatar: StagedAvatar) -> None:
     """Define a rig: its skeleton, the skin weights of the mesh at all levels of detail, and which motions belong to
     it."""
     skeleton = UsdSkel.Skeleton.Define(stage, SKELETON)
-    skeleton.CreateJointsAttr(joint_paths(rig.skeleton))
-    skeleton.CreateJointNamesAttr(rig.skeleton.names)
+    names = avatar.joint_names
+    skeleton.CreateJointsAttr(joint_paths(rig.skeleton, names))
+    skeleton.CreateJointNamesAttr([name_in(names, joint) for joint in rig.skeleton.names])
     skeleton.CreateRestTransformsAttr(_matrices(rig.skeleton.local(rig.skeleton.bind)))
     skeleton.CreateBindTransformsAttr(_matrices(rig.skeleton.bind))
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([MOTION.AppendChild(name)])
     skeleton.GetPrim().SetDocumentation(REST_NOTE)
-    skeleton.GetPrim().SetCustomData({"restPose": REST_POSE, "jointNamesIn": _names_elsewhere(rig.skeleton)})
+    skeleton.GetPrim().SetCustomData({"restPose": REST_POSE, "jointNamesIn": _names_elsewhere(rig.skeleton, names)})
     influences = rig.skin.joints.shape[1]
-    for number, level in enumerate(levels):
+    for number, level in enumerate(avatar.levels):
         binding = UsdSkel.BindingAPI.Apply(stage.OverridePrim(surface_path(number)))
         binding.CreateSkeletonRel().SetTargets([SKELETON])
         indices = binding.CreateJointIndicesPrimvar(False, influences)
@@ -166,7 +166,7 @@ def author_motion(stage: Usd.Stage, name: str, avatar: StagedAvatar) -> None:
         boxes.Set(vec3f(box_m), code)
     for rig_name, rig in avatar.rigs.items():
         motion = rig.motions[name]
-        joints = joint_paths(rig.skeleton)
+        joints = joint_paths(rig.skeleton, avatar.joint_names)
         animation = UsdSkel.Animation.Define(stage, MOTION.AppendChild(rig_name))
         animation.CreateJointsAttr(joints)
         animation.CreateScalesAttr(Vt.Vec3hArray(len(joints), Gf.Vec3h(1, 1, 1)))
@@ -211,19 +211,23 @@ def author_splats(stage: Usd.Stage, avatar: StagedAvatar, splats: Splats) -> Non
     UsdGeom.ModelAPI(stage.GetDefaultPrim()).SetExtentsHint(extent(np.concatenate(everywhere)))
 
 
-def joint_paths(skeleton: Skeleton) -> list[str]:
+def joint_paths(skeleton: Skeleton, names: JointNames) -> list[str]:
     """Return the skeleton's joint tokens, like "root/pelvis/thigh_L", every part a valid identifier (Blender drops
     bones whose names are not)."""
     paths: list[str] = []
-    for name, parent in zip(skeleton.names, skeleton.parents, strict=True):
-        paths.append(f"{paths[parent]}/{_identifier(name)}" if parent >= 0 else _identifier(name))
+    for joint, parent in zip(skeleton.names, skeleton.parents, strict=True):
+        name = _identifier(name_in(names, joint))
+        paths.append(f"{paths[parent]}/{name}" if parent >= 0 else name)
     return paths
 
 
-def _names_elsewhere(skeleton: Skeleton) -> dict[str, dict[str, str]]:
-    """Return the joints' names in other skeletons, by skeleton and joint."""
-    known = {name: EQUIVALENTS[name] for name in skeleton.names if name in EQUIVALENTS}
-    return {s: {ours: getattr(n, s) for ours, n in known.items() if getattr(n, s)} for s in SKELETONS}
+def _names_elsewhere(skeleton: Skeleton, names: JointNames) -> dict[str, dict[str, str]]:
+    """Return the joints' names in other skeletons, by skeleton and by the name that the joint has in the file; and, if
+    that is not its own, its own name."""
+    known = {name_in(names, joint): EQUIVALENTS[joint] for joint in skeleton.names if joint in EQUIVALENTS}
+    elsewhere = {s: {called: getattr(n, s) for called, n in known.items() if getattr(n, s)} for s in SKELETONS}
+    own = {name_in(names, joint): joint for joint in skeleton.names if name_in(names, joint) != joint}
+    return elsewhere | ({OWN: own} if own else {})
 
 
 def define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, stage_from_world: np.ndarray) -> UsdGeom.Camera:

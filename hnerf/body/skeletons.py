@@ -6,9 +6,11 @@ SMPL-X (joint names of its package), and CMU's motion capture database as it is 
 """
 
 import re
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 ROOT, PELVIS = "root", "pelvis"
+JointNames = Literal["own", "ue5", "mixamo", "humanik", "vrm", "smplx"]  # after whose joints exports name theirs
+OWN: JointNames = "own"
 
 # Names of the body models' joints (hnerf/body/anny.py, hnerf/body/smpl.py), without side, where exports rename them.
 _RENAMED = {
@@ -43,6 +45,7 @@ class Names(NamedTuple):
 
 
 SKELETONS = Names._fields
+PREFIXES = {"mixamo": "mixamorig:"}  # of names in Mixamo's own files; names in USD have no colon
 
 
 def exported_name(joint: str) -> str:
@@ -108,6 +111,13 @@ EQUIVALENTS: dict[str, Names] = {
     "head": Names("head", "Head", "Head", "head", "head", "Head"),
     **{f"{joint}_{side[0]}": _of_side(names, side) for side in ("Left", "Right") for joint, names in _sided().items()},
 }
+
+
+def name_in(skeleton: str, joint: str, prefixed: bool = False) -> str:
+    """Return the name of an exported joint in another skeleton, one of SKELETONS, with that skeleton's prefix if
+    `prefixed`; its exported name if that skeleton has no such joint, or is OWN."""
+    theirs = getattr(EQUIVALENTS.get(joint), skeleton, "")
+    return PREFIXES.get(skeleton, "") * prefixed + theirs if theirs else joint
 
 
 def exported_from(skeleton: str) -> dict[str, str]:

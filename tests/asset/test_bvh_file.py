@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from hnerf.asset.bvh_file import write_avatar_bvh
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.bvh import read_bvh
+from hnerf.body.skeletons import JointNames
 from tests.asset.figure import FRAMES
 
 
@@ -25,6 +26,14 @@ def with_axes(staged: StagedAvatar, axes: np.ndarray) -> StagedAvatar:
     return dataclasses.replace(
         staged, rigs=staged.rigs | {"game": dataclasses.replace(game, skeleton=skeleton, motions=motions)}
     )
+
+
+@pytest.mark.parametrize(("joint_names", "pelvis"), [("mixamo", "mixamorig:Hips"), ("ue5", "pelvis"), ("vrm", "hips")])
+def test_bvh_has_the_joint_names_of_the_asset(
+    joint_names: JointNames, pelvis: str, staged: StagedAvatar, tmp_path: Path
+) -> None:
+    write_avatar_bvh(tmp_path / "avatar.bvh", dataclasses.replace(staged, joint_names=joint_names))
+    assert read_bvh(tmp_path / "avatar.bvh").names == (pelvis, "upper_L")
 
 
 @pytest.mark.parametrize("axes", [np.eye(3), Rotation.from_euler("zx", [40, 90], degrees=True).as_matrix()])

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdSkel
 from threadpoolctl import threadpool_info, threadpool_limits
 from torch import Tensor
 
@@ -147,6 +147,15 @@ def test_files_at_other_rates_are_left_out_if_poses_are_far_apart(
         "column: no avatar_24.usda, avatar_30.usda and avatar.bvh: the captured poses are too far apart to be "
         "interpolated; list more frames in capture.toml"
     ]
+
+
+@pytest.mark.usefixtures("small_report")
+def test_joints_are_named_as_set(tmp_path: Path) -> None:
+    settings = TINY.model_copy(update={"joint_names": "humanik"})
+    export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), settings, tmp_path)
+    stage = Usd.Stage.Open(str(tmp_path / "avatar.usdz"))
+    skeleton = stage.GetPrimAtPath("/Avatar/Body/Skeleton")
+    assert list(UsdSkel.Skeleton(skeleton).GetJointNamesAttr().Get()) == ["Reference", "Hips", "upper_L"]
 
 
 def test_a_motion_that_lacks_a_joint_is_refused_before_any_work(

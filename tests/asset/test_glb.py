@@ -18,6 +18,7 @@ from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
 from hnerf.asset.usd import SKELETON, surface_path
 from hnerf.body.descriptor import normals_of
+from hnerf.body.skeletons import JointNames
 from tests.asset.figure import FRAMES
 
 KHRONOS = """
@@ -127,6 +128,18 @@ def test_another_reader_finds_mesh_texture_and_joints(glb: Path, rig: str, stage
 def test_mesh_and_skin_have_the_names_of_their_prims_in_usd(glb: Path) -> None:
     document = pygltflib.GLTF2.load(str(glb))
     assert (document.meshes[0].name, document.skins[0].name) == (surface_path(0).name, SKELETON.name)
+
+
+@pytest.mark.parametrize(
+    ("joint_names", "names"), [("mixamo", ["root", "mixamorig:Hips"]), ("humanik", ["Reference", "Hips"])]
+)
+def test_nodes_have_the_joint_names_of_the_asset(
+    joint_names: JointNames, names: list[str], staged: StagedAvatar, tmp_path: Path
+) -> None:
+    renamed = dataclasses.replace(staged, joint_names=joint_names)
+    write_glb(tmp_path / "avatar.glb", renamed, renamed.rigs["full"])
+    nodes = pygltflib.GLTF2.load(str(tmp_path / "avatar.glb")).nodes
+    assert [node.name for node in nodes] == [*names, "upper_L", "Surface"]
 
 
 def test_a_normal_map_comes_with_tangents(glb: Path, staged: StagedAvatar) -> None:

@@ -17,7 +17,7 @@ from hnerf.asset.quads import polygon_corners
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import StagedAvatar, stage_avatar
 from hnerf.asset.texture import unwrap
-from hnerf.asset.validation import each_variant
+from hnerf.asset.validation import each_variant, validate_package
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from tests.asset.figure import FRAMES, INFO, bending_body, write_all
@@ -260,6 +260,26 @@ def test_the_skeleton_names_its_rest_pose_and_joints_of_other_skeletons(package:
     data = skeleton.GetPrim().GetCustomData()
     assert data["restPose"] == "A"
     assert data["jointNamesIn"]["mixamo"] == {"pelvis": "Hips"}
+    assert "own" not in data["jointNamesIn"]
+
+
+def test_joints_can_have_the_names_of_another_skeleton(staged: StagedAvatar, tmp_path: Path) -> None:
+    """Mixamo has no root and no upper joint; USD allows no colon, so its prefix is left out."""
+    write_all(tmp_path, dataclasses.replace(staged, joint_names="mixamo"))
+    stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
+    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton"))
+    for rig in ("full", "game"):
+        stage.GetDefaultPrim().GetVariantSet("rig").SetVariantSelection(rig)
+        joints = ["root", "root/Hips", "root/Hips/upper_L"]
+        assert list(skeleton.GetJointsAttr().Get()) == joints
+        assert list(skeleton.GetJointNamesAttr().Get()) == ["root", "Hips", "upper_L"]
+        assert (
+            list(UsdSkel.Animation(stage.GetPrimAtPath(f"/Avatar/Body/Motion/{rig}")).GetJointsAttr().Get()) == joints
+        )
+    names = skeleton.GetPrim().GetCustomData()["jointNamesIn"]
+    assert (names["own"], names["vrm"]) == ({"Hips": "pelvis"}, {"Hips": "hips"})
+    for name in ("avatar.usda", "avatar.usdz"):
+        assert validate_package(tmp_path / name)["warnings"] == []
 
 
 def test_without_payloads_only_the_interface_is_loaded(package: Path) -> None:

@@ -166,6 +166,15 @@ def test_an_eye_joint_off_the_centre_of_its_eyeball_is_reported(stage: Usd.Stage
         assert ("does not turn about" in "; ".join(data_defects(stage))) is wrong
 
 
+def test_eyes_are_checked_whatever_their_joints_are_called(stage: Usd.Stage) -> None:
+    joints(stage, "root", "root/hips", "root/hips/leftEye")
+    own = {"hips": "pelvis", "leftEye": "eye_L"}
+    skeleton(stage).GetPrim().SetCustomDataByKey("jointNamesIn", {"own": own})
+    defects = "; ".join(data_defects(stage))
+    assert "skin follows one eye and not the other" in defects and "eye_L does not turn about" in defects
+    assert "no root on the ground" not in defects
+
+
 def test_a_small_child_may_squat(package: Path) -> None:
     """The cache of a column of 1.7 m, at a quarter of its size, has only posed surfaces, which may have any size."""
     stage = Usd.Stage.Open(str(package / "avatar_cache.usdz"))

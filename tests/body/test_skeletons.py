@@ -1,9 +1,23 @@
 import re
 from collections import Counter
 from pathlib import Path
+from typing import get_args
+
+import pytest
 
 from hnerf.body.anny import anny_model
-from hnerf.body.skeletons import EQUIVALENTS, SKELETONS, exported_from, exported_name, is_serial
+from hnerf.body.skeletons import (
+    EQUIVALENTS,
+    OWN,
+    SKELETONS,
+    JointNames,
+    exported_from,
+    exported_name,
+    is_serial,
+    name_in,
+)
+from hnerf.body.smpl import FURTHER_JOINTS, JOINTS
+from hnerf.config import AssetSettings
 
 
 def test_exported_joint_names_are_readable() -> None:
@@ -35,6 +49,29 @@ def test_equivalent_names_in_other_skeletons() -> None:
         theirs = [getattr(names, skeleton) for names in EQUIVALENTS.values() if getattr(names, skeleton)]
         assert len(theirs) == len(set(theirs)), skeleton
         assert exported_from(skeleton)[theirs[0]] in EQUIVALENTS
+
+
+def test_a_joint_without_an_equivalent_keeps_its_name() -> None:
+    assert [name_in("mixamo", joint, prefixed=True) for joint in ("pelvis", "spine_02")] == [
+        "mixamorig:Hips",
+        "spine_02",
+    ]
+    assert [name_in("mixamo", joint) for joint in ("pelvis", "jaw")] == ["Hips", "jaw"]
+    assert [name_in(OWN, "hand_L", prefixed=True), name_in("vrm", "hand_L", prefixed=True)] == ["hand_L", "leftHand"]
+
+
+@pytest.mark.parametrize("joints", [anny_model().bone_labels, *((*JOINTS, *more) for more in FURTHER_JOINTS.values())])
+def test_names_in_other_skeletons_are_unique_in_any_letter_case(joints: tuple[str, ...]) -> None:
+    """Unreal Engine ignores case."""
+    own = ["root", *map(exported_name, joints)]
+    for skeleton in get_args(JointNames):
+        assert len({name_in(skeleton, joint, prefixed=True).lower() for joint in own}) == len(own), skeleton
+
+
+def test_exports_can_name_joints_after_each_skeleton_of_characters() -> None:
+    """CMU's is that of recordings."""
+    assert get_args(JointNames) == (OWN, *(name for name in SKELETONS if name != "cmu"))
+    assert get_args(AssetSettings.model_fields["joint_names"].annotation) == get_args(JointNames)
 
 
 def test_the_documented_table_of_joint_names_is_up_to_date() -> None:

@@ -1,14 +1,16 @@
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from hnerf.body.anny import anny_model
 from hnerf.body.bvh import Bvh, write_bvh
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, joint_transforms
-from hnerf.body.skeletons import EQUIVALENTS, exported_name
+from hnerf.body.skeletons import EQUIVALENTS, JointNames, exported_name, is_serial, name_in
 from hnerf.errors import InputError
 from hnerf.render.bvh_motion import joints_by_name, retargeted
 from hnerf.render.motion import read_motion
@@ -104,6 +106,16 @@ def test_a_rest_pose_may_face_any_direction_or_have_z_up(turned: Rotation, rig: 
 def test_joints_are_found_by_name(skeleton: str, prefix: str) -> None:
     file = t_pose(1, skeleton, prefix)
     assert joints_by_name(Path("a.bvh"), file.names) == {name: j for j, name in enumerate(T_POSE)}
+
+
+@pytest.mark.parametrize("joint_names", get_args(JointNames))
+def test_joints_of_exported_motions_are_found_whatever_they_are_named_after(joint_names: JointNames) -> None:
+    """Joints that the other skeleton lacks have exported names in these files, which are ignored."""
+    exported = [exported_name(name) for name in anny_model().bone_labels if not is_serial(exported_name(name))]
+    names = tuple(name_in(joint_names, joint, prefixed=True) for joint in exported)
+    found = joints_by_name(Path("a.bvh"), names)
+    assert all(exported[j] == joint for joint, j in found.items())
+    assert {"pelvis", "spine_01", "spine_03", "spine_05", "head", "clavicle_L", "hand_R", "foot_L"} <= set(found)
 
 
 def test_a_file_of_the_cmu_database_is_not_taken_for_another_skeleton() -> None:
