@@ -302,7 +302,7 @@ class AssetSettings(Section):
     """Settings of the exported assets."""
 
     grid_cells: int = Field(default=256, ge=16, le=1024)  # of marching cubes, along the longest side
-    topology: Literal["registered", "captured", "both"] = "registered"  # body model's mesh, marching cubes', both
+    topology: Literal["auto", "registered", "captured", "both"] = "auto"  # of the mesh: see docs/asset.md, Both meshes
     faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered mesh has the body model's
     level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # most triangles of each lower level of detail
     texture_px: int = Field(default=1024, ge=16, le=8192)  # side of the texture

@@ -23,7 +23,7 @@ from hnerf.asset.figures import beyond_skinning_mm, level_figures, mesh_figures,
 from hnerf.asset.glb import write_glb
 from hnerf.asset.normal_map import normal_map
 from hnerf.asset.package import AssetInfo, Avatars, write_cache, write_package, write_splats, write_usdz
-from hnerf.asset.regions import findings, surface_distances_mm
+from hnerf.asset.regions import chosen_topology, findings, surface_distances_mm
 from hnerf.asset.report import write_report
 from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.splat_ply import write_splat_ply
@@ -107,7 +107,10 @@ def export_asset(
         for name, motion in (further or {}).items()
     }
     meshes = _rest_meshes(avatar, settings, seconds)
-    topology = "registered" if settings.topology == "both" else settings.topology
+    topology = chosen_topology(settings.topology, meshes.distances_mm["registered"])
+    found = findings(settings.topology, meshes.distances_mm["registered"])
+    for line in found:
+        log.warning("%s: %s", capture.name, line)
     asset, captured = _mesh_asset(capture, masks, avatar, meshes, topology, settings, added), None
     if settings.topology == "both":
         bare = settings.model_copy(update={"splats": 0})  # the first mesh alone has splats
@@ -130,6 +133,7 @@ def export_asset(
         with timed("blender", seconds, log):
             write_with_blender(out, blender, capture.fps)
     report = _figures(capture, meshes, asset, topology, settings) | {
+        "findings": found,
         "crossing_share": {pose.name: pose.crossing for pose in poses},
         "viewer": viewer,
         "bytes": {str(p.relative_to(out)): p.stat().st_size for p in sorted(out.rglob("*")) if p.is_file()},
@@ -232,7 +236,6 @@ def _figures(
         "surface": {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume},
         **_mesh_asset_figures(asset, topology),
         "to_surface_mm": meshes.distances_mm,
-        "findings": findings(meshes.distances_mm[topology]) if topology == "registered" else [],
         "texture_px": settings.texture_px,
         "normal_map_px": settings.normal_map_px,
         "light": light and {"coefficients": light.coefficients.round(4).tolist(), "normals_turned_deg": light.turn_deg},

@@ -43,14 +43,28 @@ def surface_distances_mm(dense: trimesh.Trimesh, meshes: Mapping[str, AssetMesh]
     return found
 
 
-def findings(distances_mm: Distances) -> list[str]:
-    """Return a line for each region in which the registered mesh does not follow the surface."""
+def chosen_topology(wanted: str, registered_mm: Distances) -> str:
+    """Return the topology of the asset's first mesh. wanted: `asset.topology`; registered_mm: the distances of the
+    registered mesh."""
+    if wanted == "auto":
+        return "captured" if _not_followed(registered_mm) else "registered"
+    return "registered" if wanted == "both" else wanted
+
+
+def findings(wanted: str, registered_mm: Distances) -> list[str]:
+    """Return a line for each region in which the registered mesh does not follow the surface, unless the captured mesh
+    was asked for. wanted, registered_mm: see `chosen_topology`."""
+    captured = "The asset has the captured mesh" if wanted == "auto" else "asset.topology=captured follows them"
     return [
-        f"{region}: 5 % of the surface is more than {d['p95']:.0f} mm from the registered mesh; loose clothes or long "
-        "hair? asset.topology=captured follows them"
-        for region, d in distances_mm.items()
-        if region != "all" and d["p95"] > LIMIT_MM
+        f"{region}: 5 % of the surface is more than {registered_mm[region]['p95']:.0f} mm from the registered mesh; "
+        f"loose clothes or long hair? {captured}"
+        for region in (_not_followed(registered_mm) if wanted != "captured" else [])
     ]
+
+
+def _not_followed(registered_mm: Distances) -> list[str]:
+    """Return the regions in which the registered mesh does not follow the surface."""
+    return [region for region, d in registered_mm.items() if region != "all" and d["p95"] > LIMIT_MM]
 
 
 def _summary(distance_mm: np.ndarray) -> dict[str, float]:

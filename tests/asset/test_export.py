@@ -20,7 +20,14 @@ from tests.asset.figure import bending_body, capture, column_rig
 from tests.asset.stand_in import StandInAvatar
 
 SMALL = AssetSettings(
-    grid_cells=96, faces=2000, level_faces=(500,), texture_px=128, photograph_frames=0, normal_map_px=64, correctives=2
+    grid_cells=96,
+    topology="registered",  # the figure's mesh is too coarse to follow its surface in every test
+    faces=2000,
+    level_faces=(500,),
+    texture_px=128,
+    photograph_frames=0,
+    normal_map_px=64,
+    correctives=2,
 )
 
 TINY = SMALL.model_copy(update={"grid_cells": 32, "texture_px": 32, "faces": 500, "correctives": 0})
@@ -131,6 +138,20 @@ def test_usd_has_both_meshes_with_topology_both(tmp_path: Path) -> None:
             corners = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Body/Surface")).GetFaceVertexCountsAttr().Get()
             triangles.append(int(np.sum(np.array(corners) - 2)))
         assert triangles == [faces, one["mesh"]["faces"]], name
+
+
+@pytest.mark.usefixtures("small_report")
+@pytest.mark.parametrize(("limit_mm", "chosen"), [(100.0, "registered"), (1e-6, "captured")])
+def test_the_captured_mesh_replaces_a_registered_one_that_does_not_follow(
+    limit_mm: float, chosen: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("hnerf.asset.regions.LIMIT_MM", limit_mm)
+    auto = TINY.model_copy(update={"topology": "auto"})
+    report = export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), auto, tmp_path)
+    assert report["mesh"]["topology"] == chosen
+    lines = [r.message.removeprefix("column: ") for r in caplog.records if "the registered mesh" in r.message]
+    assert lines == report["findings"] and bool(lines) == (chosen == "captured")
+    assert all(line.endswith("The asset has the captured mesh") for line in lines)
 
 
 @pytest.mark.usefixtures("small_report")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hnerf.asset.correctives import as_they_are
-from hnerf.asset.regions import LIMIT_MM, _summary, findings, region_of, surface_distances_mm
+from hnerf.asset.regions import LIMIT_MM, _summary, chosen_topology, findings, region_of, surface_distances_mm
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.topologies import AssetMesh
 from tests.asset.figure import column_rig, upright_column
@@ -32,8 +32,8 @@ def test_distances_from_the_fields_surface_to_each_mesh() -> None:
     assert found["registered"]["all"]["p95"] == pytest.approx(20, abs=0.3)
     assert found["captured"]["all"]["p95"] == pytest.approx(5, abs=0.3)
     assert set(found["registered"]) == {"all", "torso"}
-    assert findings(found["captured"]) == []
-    (line,) = findings(found["registered"])
+    assert findings("registered", found["captured"]) == [] == findings("captured", found["registered"])
+    (line,) = findings("registered", found["registered"])
     assert line.startswith("torso: ") and "20 mm" in line and "topology=captured" in line
 
 
@@ -49,7 +49,16 @@ def test_distances_are_assigned_to_regions_by_skinning_joints() -> None:
 
 
 def test_a_region_exactly_at_the_limit_is_not_reported() -> None:
-    assert findings({"all": {"mean": 50, "p95": 99}, "legs": {"mean": 1.0, "p95": LIMIT_MM}}) == []
+    at_limit = {"all": {"mean": 50, "p95": 99}, "legs": {"mean": 1.0, "p95": LIMIT_MM}}
+    assert findings("auto", at_limit) == [] and chosen_topology("auto", at_limit) == "registered"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "chosen"),
+    [("auto", "captured"), ("registered", "registered"), ("captured", "captured"), ("both", "registered")],
+)
+def test_only_auto_falls_back_to_the_captured_mesh(wanted: str, chosen: str) -> None:
+    assert chosen_topology(wanted, {"legs": {"mean": 1.0, "p95": LIMIT_MM + 0.1}}) == chosen
 
 
 def test_mean_and_95th_percentile() -> None:
