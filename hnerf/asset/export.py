@@ -120,7 +120,8 @@ def export_asset(
     with timed("poses", seconds, log):
         poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
     with timed("files", seconds, log):
-        info = AssetInfo(capture.name, settings.version, settings.licence, digest)
+        chosen, close = settings.model_dump(exclude={"version", "licence"}), _closeness(meshes, asset, topology)
+        info = AssetInfo(capture.name, settings.version, settings.licence, digest, chosen, close)
         avatars = {"registered": staged, "captured": captured.staged} if captured else {"": staged}
         write_files(out, avatars, capture, info, splats)
     with timed("viewer", seconds, log):
@@ -247,6 +248,13 @@ def _figures(
         "frames": len(capture.frames),
         "cameras": len(capture.cameras),
     }
+
+
+def _closeness(meshes: RestMeshes, asset: MeshAsset, topology: str) -> dict[str, Any]:
+    """Return the figures of the mesh against the field's surface, and of the asset against the field, as in the
+    report."""
+    against_field = {name: value for name, value in asset.against_field.items() if name != "per_image"}
+    return {"topology": topology, "to_surface_mm": meshes.distances_mm[topology]["all"], "against_field": against_field}
 
 
 def _mesh_asset_figures(asset: MeshAsset, topology: str) -> dict[str, Any]:

@@ -12,15 +12,16 @@ variants, and the names of payloads and images start with the variant's name.
 
 import struct
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 from zipfile import ZipFile, is_zipfile
 
 import numpy as np
-from pxr import Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
+from pxr import Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
 
 from hnerf.asset import usd
 from hnerf.asset.materialx import author_network
@@ -41,12 +42,14 @@ Avatars = dict[str, StagedAvatar]  # by topology; if there is only one, by "" an
 @dataclass(frozen=True)
 class AssetInfo:
     """The package's metadata. name: of the subject; version, licence: as given by the user; capture: the digest of the
-    recording."""
+    recording; settings: those of the asset, by name; figures: how close it is to its field, as in `report.json`."""
 
     name: str
     version: str
     licence: str
     capture: str
+    settings: Mapping[str, Any]
+    figures: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,7 @@ def write_usdz(path: Path, avatars: Avatars, cameras: Iterable[Camera], fps: flo
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         layer = Path(folder) / "avatar.usdc"
         stage = _new_stage(layer, path.name, avatars, _time_range(avatars, CAPTURED, fps), fps, info)
+        _describe(stage, info)
         for part in _parts(avatars, list(cameras), fps):
             with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
                 part.author(stage)
@@ -188,6 +192,7 @@ def _write_interface(file: Path, parts: list[Part], avatars: Avatars, fps: float
     """Write an interface layer with a rate of its time codes and with that motion selected. It refers to the payloads
     directly: time codes that are scaled twice are not whole, and importers that hold samples would be a frame late."""
     stage = _new_stage(file, file.name, avatars, _time_range(avatars, motion, fps), fps, info)
+    _describe(stage, info)
     for part in parts:
         path = f"./{PAYLOADS}/{part.name}.usdc"
         with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
@@ -223,6 +228,13 @@ def _new_stage(file: Path, name: str, avatars: Avatars, codes: np.ndarray, fps: 
         root.SetAssetInfoByKey(key, value)
     UsdGeom.ModelAPI.Apply(root).SetExtentsHint(usd.extent(np.concatenate([*map(_everywhere, avatars.values())])))
     return stage
+
+
+def _describe(stage: Usd.Stage, info: AssetInfo) -> None:
+    """Add how the asset was made, and how close it is to its field, to the root prim's metadata."""
+    settings = {name: Vt.IntArray(v) if isinstance(v, tuple) else v for name, v in info.settings.items()}
+    stage.GetDefaultPrim().SetAssetInfoByKey("settings", settings)
+    stage.GetDefaultPrim().SetAssetInfoByKey("figures", dict(info.figures))
 
 
 def _set_units(stage: Usd.Stage, fps: float) -> None:

@@ -18,7 +18,14 @@ from hnerf.geometry.camera import Camera
 from tests.body.boxes import hinged
 
 FRAMES = (3, 4, 5, 8)  # with a gap
-INFO = AssetInfo("column", "7", "CC0-1.0", "0123abcd")
+INFO = AssetInfo(
+    "column",
+    "7",
+    "CC0-1.0",
+    "0123abcd",
+    {"level_faces": (500,), "none": (), "topology": "auto"},
+    {"field": {"psnr": 32.5}},
+)
 
 
 def column_rig() -> Rig:

@@ -109,7 +109,11 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
     assert report["against_field"]["images"] == 0 and list(report["crossing_share"]) == ["Frown", "Stout"]
     assert "Extreme poses" in page and "Asset and field" not in page
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
-    assert stage.GetDefaultPrim().GetAssetInfoByKey("captureDigest") == "0123"
+    info = stage.GetDefaultPrim().GetAssetInfo()
+    assert info["captureDigest"] == "0123" and info["settings"]["grid_cells"] == SMALL.grid_cells
+    assert not {"version", "licence"} & set(info["settings"])
+    assert info["figures"]["to_surface_mm"] == report["to_surface_mm"]["registered"]["all"]
+    assert info["figures"]["against_field"] == {"images": 0, "reason": "no image has a mask of the person"}
 
 
 @pytest.mark.usefixtures("small_report")

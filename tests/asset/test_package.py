@@ -252,6 +252,16 @@ def test_the_root_prim_says_what_the_asset_is(name: str, package: Path) -> None:
     assert (root.GetAssetInfoByKey("captureDigest"), root.GetAssetInfoByKey("licence")) == ("0123abcd", "CC0-1.0")
 
 
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
+def test_the_root_prim_says_how_the_asset_was_made(name: str, package: Path) -> None:
+    """USD refuses an empty tuple as it is."""
+    stage = Usd.Stage.Open(str(package / name))
+    info = stage.GetDefaultPrim().GetAssetInfo()
+    settings = {key: value if isinstance(value, str) else list(value) for key, value in info["settings"].items()}
+    assert settings == {"topology": "auto", "level_faces": [500], "none": []}
+    assert info["figures"] == {"field": {"psnr": 32.5}}
+
+
 def test_the_skeleton_names_its_rest_pose_and_joints_of_other_skeletons(package: Path) -> None:
     stage = Usd.Stage.Open(str(package / "avatar.usda"))
     skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton"))
