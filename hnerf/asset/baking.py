@@ -1,6 +1,8 @@
 """The asset's textures, from the field's colours and the training photographs: with the recording's light and without
 it."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from hnerf.asset.albedo import Albedo, AlbedoBlend, mean_irradiance
@@ -22,6 +24,22 @@ MOST_TEXELS = 1 << 29  # of all photographs together: what they show is kept, ab
 CAVITY_BRIGHTNESS = 0.3  # factor of sRGB values
 
 
+@dataclass(frozen=True)
+class Filled:
+    """The texels that no photograph shows, so that the field fills them. mask (H, W) uint8: 255 there, 0 elsewhere;
+    share: of all texels in charts."""
+
+    mask: np.ndarray
+    share: float
+
+    @classmethod
+    def of(cls, texels: Texels, unseen: np.ndarray, texture_px: int) -> "Filled":
+        """Return the mask of texels unseen (N,) bool."""
+        mask = np.zeros((texture_px, texture_px), np.uint8)
+        mask[texels.row.numpy(), texels.column.numpy()] = 255 * unseen
+        return cls(mask, float(unseen.mean()))
+
+
 def baked_textures(
     capture: Capture,
     avatar: Avatar,
@@ -30,9 +48,9 @@ def baked_textures(
     layout: UvLayout,
     settings: AssetSettings,
     cavities: np.ndarray,
-) -> tuple[np.ndarray, Albedo | None]:
-    """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, and its albedo, None if the texture is the field's
-    alone.
+) -> tuple[np.ndarray, Albedo | None, Filled]:
+    """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, its albedo, None if the texture is the field's
+    alone, and what the field fills.
 
     surfaces_m (n, V, 3): the body's surface in the world in each frame; cavities (V,) bool: vertices deep inside mouth
     and nose, which are darkened because little light reaches them.
@@ -42,7 +60,8 @@ def baked_textures(
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
     if not settings.photograph_frames:
         field = field_colours(avatar, posed, texels, cavities)
-        return texture_image(texels, field * lit, settings.texture_px), None
+        filled = Filled.of(texels, np.ones(len(field), bool), settings.texture_px)
+        return texture_image(texels, field * lit, settings.texture_px), None, filled
     field = _coarse_field_colours(avatar, posed, layout, texels, settings.texture_px, cavities)
     frames = photographed_frames(capture, settings)
     photographed = {frame: SeenSurface.of(surfaces_m[clothed.index(frame)], faces) for frame in frames}
@@ -59,7 +78,7 @@ def baked_textures(
 
     blends: list[CapturedBlend | AlbedoBlend] = [captured, albedo]
     texture, delit = side_by_side(finished, blends)
-    return texture, Albedo(delit, light)
+    return texture, Albedo(delit, light), Filled.of(texels, captured.unseen, settings.texture_px)
 
 
 def photographed_frames(capture: Capture, settings: AssetSettings) -> list[int]:

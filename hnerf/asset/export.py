@@ -13,7 +13,7 @@ import torch
 import trimesh
 from threadpoolctl import threadpool_limits
 
-from hnerf.asset.baking import baked_textures
+from hnerf.asset.baking import Filled, baked_textures
 from hnerf.asset.blender import write_with_blender
 from hnerf.asset.bvh_file import write_avatar_bvh
 from hnerf.asset.comparison import Compared, compare_with_field, comparison_figures, require_close
@@ -35,7 +35,7 @@ from hnerf.asset.viewer import write_viewer
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.progress import timed
@@ -71,11 +71,12 @@ class ClothedSurface:
 
 @dataclass(frozen=True)
 class MeshAsset:
-    """The asset of one mesh: what is written of it, its views next to the field's with their figures, and the seconds
-    of each step."""
+    """The asset of one mesh: what is written of it, what of its texture the field fills, its views next to the field's
+    with their figures, and the seconds of each step."""
 
     surface: ClothedSurface
     staged: StagedAvatar
+    filled: Filled
     splats: Splats | None
     compared: list[Compared]
     against_field: dict[str, Any]
@@ -124,6 +125,7 @@ def export_asset(
         info = AssetInfo(capture.name, settings.version, settings.licence, digest, chosen, close)
         avatars = {"registered": staged, "captured": captured.staged} if captured else {"": staged}
         write_files(out, avatars, capture, info, splats)
+        write_image(out / "filled.png", asset.filled.mask)
     with timed("viewer", seconds, log):
         viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with timed("validation", seconds, log):
@@ -148,7 +150,7 @@ def export_asset(
     (out / "report.json").write_text(json.dumps(report, indent=1))
     shown = capture.train_frames[0]
     root = surface.body.root[surface.body.index(shown)].numpy()
-    write_report(out / "report.html", capture.name, staged, shown, root, asset.compared, poses, report)
+    write_report(out / "report.html", capture.name, staged, asset.filled, shown, root, asset.compared, poses, report)
     return report
 
 
@@ -183,7 +185,7 @@ def _mesh_asset(
     mesh = surface.mesh
     layout = mesh.layout(settings.texture_px)
     with timed("texture", seconds, log):
-        texture, albedo = baked_textures(
+        texture, albedo, filled = baked_textures(
             capture, timeless, surface.body, surface.surfaces_m, layout, settings, mesh.cavities
         )
     with timed("normal map", seconds, log):
@@ -212,7 +214,7 @@ def _mesh_asset(
         compared = compare_with_field(capture, masks, avatar, staged, splats)
         against_field = comparison_figures(compared)
     require_close(capture.name, topology, against_field, settings.allow_poor)
-    return MeshAsset(surface, staged, splats, compared, against_field, seconds)
+    return MeshAsset(surface, staged, filled, splats, compared, against_field, seconds)
 
 
 def _clothed_surface(capture: Capture, avatar: Avatar, mesh: AssetMesh, settings: AssetSettings) -> ClothedSurface:
@@ -263,6 +265,7 @@ def _mesh_asset_figures(asset: MeshAsset, topology: str) -> dict[str, Any]:
     return {
         "mesh": mesh_figures(topology, surface.mesh, asset.staged),
         "levels": level_figures(asset.staged),
+        "filled_share": asset.filled.share,
         "beyond_skinning_mm": beyond_skinning_mm(surface.displacements_m, surface.correctives),
         "against_field": asset.against_field,
     }

@@ -130,6 +130,11 @@ class CapturedBlend:
         self._total[seen.index] += counts * seen.colours
         self._projection.add(seen.pixels, counts)
 
+    @property
+    def unseen(self) -> np.ndarray:
+        """Return the texels that no photograph shows, (N,) bool."""
+        return self._weight[:, 0] == FIELD_WEIGHT
+
     def colours(self) -> np.ndarray:
         """Return the colours (N, 3) in [0, 1]."""
         return self._projection.sharpened(self._total / self._weight, self._weight)

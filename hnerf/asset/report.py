@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hnerf.asset.baking import Filled
 from hnerf.asset.comparison import Compared
 from hnerf.asset.extreme_poses import ExtremePose
 from hnerf.asset.pictures import textured, turntable_cameras, uv_picture, wireframe
@@ -31,6 +32,7 @@ def write_report(
     path: Path,
     name: str,
     avatar: StagedAvatar,
+    filled: Filled,
     frame: int,
     world_from_body: np.ndarray,
     compared: list[Compared],
@@ -61,6 +63,10 @@ def write_report(
             texture=[
                 captioned("Texture", shrunk(avatar.texture, SQUARE_PX)),
                 captioned("Layout", uv_picture(avatar, SQUARE_PX)),
+                captioned(
+                    f"White: the {filled.share:.1%} of texels that no photograph shows, filled by the field",
+                    cv2.cvtColor(shrunk(filled.mask, SQUARE_PX), cv2.COLOR_GRAY2RGB),
+                ),
                 *_without_light(avatar),
             ],
             against_field=[_beside_field(view) for view in evenly_spaced(compared, COMPARED)],

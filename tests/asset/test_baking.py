@@ -61,7 +61,9 @@ def test_the_albedo_of_a_uniform_column_is_uniform(pictures: dict[int, np.ndarra
     surfaces_m = body.vertices_m().double().numpy()
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
-    texture, albedo = baked_textures(capture, Grey(body), body, surfaces_m, layout, SETTINGS, figure.no_cavities(body))
+    texture, albedo, _ = baked_textures(
+        capture, Grey(body), body, surfaces_m, layout, SETTINGS, figure.no_cavities(body)
+    )
     assert albedo is not None
     light = albedo.light.coefficients / albedo.light.coefficients[0]
     np.testing.assert_allclose(light, SUN.coefficients / 0.7, atol=0.03)
@@ -70,14 +72,32 @@ def test_the_albedo_of_a_uniform_column_is_uniform(pictures: dict[int, np.ndarra
     np.testing.assert_allclose(without, GREY, atol=0.03)
 
 
+def test_the_field_fills_what_no_photograph_shows(pictures: dict[int, np.ndarray]) -> None:
+    """A photograph of one frame shows at most the half of the column that faces the camera, and no cap from above."""
+    body = figure.bending_body()
+    surfaces_m = body.vertices_m().double().numpy()
+    layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
+    capture = Pictured(**vars(figure.capture()), pictures=pictures)
+    settings = SETTINGS.model_copy(update={"photograph_frames": 1})
+    *_, filled = baked_textures(capture, Grey(body), body, surfaces_m, layout, settings, figure.no_cavities(body))
+    (frame,), faces, texels = photographed_frames(capture, settings), body.rig.faces.numpy(), rasterise(layout, 64)
+    corners_m = surfaces_m[body.index(frame)][faces]
+    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    away = (normals * (figure.side_camera().centre_m - corners_m.mean(1))).sum(1) < 0
+    white = filled.mask[texels.row, texels.column] == 255
+    assert filled.share == white.mean() and 0.5 < filled.share < 0.9
+    assert (filled.mask == 255).sum() == white.sum()
+    assert white[away[texels.face.numpy()]].mean() > 0.95 and white[~away[texels.face.numpy()]].mean() < 0.6
+
+
 def test_there_is_no_albedo_without_photographs() -> None:
     body = figure.bending_body()
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     settings = SETTINGS.model_copy(update={"photograph_frames": 0})
-    texture, albedo = baked_textures(
+    texture, albedo, filled = baked_textures(
         figure.capture(), Grey(body), body, np.zeros(0), layout, settings, figure.no_cavities(body)
     )
-    assert albedo is None and texture.shape == (64, 64, 3)
+    assert albedo is None and texture.shape == (64, 64, 3) and filled.share == 1
 
 
 def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
@@ -91,7 +111,7 @@ def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
     for photographs in (0, 3):
         settings, shown = SETTINGS.model_copy(update={"photograph_frames": photographs}), []
         for cavities in (figure.no_cavities(body), vertices_m[:, 2] > 0.85):
-            texture, _ = baked_textures(capture, Grey(body), body, surfaces_m, layout, settings, cavities)
+            texture, *_ = baked_textures(capture, Grey(body), body, surfaces_m, layout, settings, cavities)
             shown.append(texture[texels.row, texels.column, 0].astype(float))
         ratio = shown[1] / shown[0]
         assert np.median(ratio[z_m.min(1) > 0.85]) == pytest.approx(CAVITY_BRIGHTNESS, abs=0.05)

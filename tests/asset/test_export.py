@@ -62,7 +62,7 @@ def test_the_mesh_has_the_mean_displacement_of_training_frames() -> None:
 
 
 FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
-FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png", "avatar/normal_map.png"}
+FILES |= {"avatar_game.glb", "avatar.bvh", "filled.png", "avatar/texture.png", "avatar/normal_map.png"}
 FILES |= {f"avatar/{name}.usdc" for name in ("look_captured", "cameras", "rig_full", "rig_game")}
 FILES |= {"avatar/geometry_lod0.usdc", "avatar/geometry_lod1.usdc", "avatar/shape_stout.usdc"}
 FILES |= {"avatar/shape_captured.usdc", "avatar_materialx.usda", "avatar/materialx_captured.usdc"}
@@ -94,12 +94,12 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
     # In frame 3 the body, which faces -Y, is turned by 2.4 rad about Z: to (sin, -cos, 0), in the stage (sin, 0, cos).
     np.testing.assert_allclose(shown_from[0], [np.sin(2.4), 0, np.cos(2.4)], atol=1e-6)
     assert report["viewer"] in page and 'href="viewer.html"' not in page
-    assert page.count("<img") == 2 + 5 + 2 + 2 + 2  # turntable, surface, an expression, a physique, texture
+    assert page.count("<img") == 2 + 5 + 2 + 2 + 3  # turntable, surface, an expression, a physique, texture
     assert report["expressions"] == ["frown"] and report["physiques"] == ["stout"]
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
     assert [report["levels"][lod]["triangles"] for lod in ("lod0", "lod1")] == [report["mesh"]["faces"], 500]
-    assert report["light"] is None  # no light without photographs
+    assert report["light"] is None and report["filled_share"] == 1  # no light without photographs
     assert (report["frames"], report["joints"], report["cameras"]) == (4, 3, 1)
     assert report["rigs"]["game"]["influences"] == 2 and report["rigs"]["game"]["moved_max_mm"] < 0.01
     assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}

@@ -7,6 +7,7 @@ import pytest
 
 from hnerf.asset import report
 from hnerf.asset.albedo import Albedo
+from hnerf.asset.baking import Filled
 from hnerf.asset.comparison import Compared
 from hnerf.asset.staging import StagedAvatar
 from hnerf.evaluation.views import View
@@ -27,7 +28,10 @@ def test_every_picture_has_its_caption(staged: StagedAvatar, tmp_path: Path, mon
     renders = {name: grey(level, 4) for name, level in levels.items()}
     scores = {name: {"psnr": float(level)} for name, level in levels.items()}
     compared = Compared(View("novel_view", "01", 4), grey(5, 3), renders, scores)
-    report.write_report(tmp_path / "report.html", "ada", avatar, 3, np.eye(4), [compared], [], {"viewer": "none"})
+    filled = Filled(grey(70, 1)[..., 0], 0.125)
+    report.write_report(
+        tmp_path / "report.html", "ada", avatar, filled, 3, np.eye(4), [compared], [], {"viewer": "none"}
+    )
     page = (tmp_path / "report.html").read_text()
     shown = {caption: int(level) for level, caption in re.findall(r'<img src="(\d+)" alt="([^"]*)"', page)}
     light = "Estimated light, +Z in the middle, +X left of it"
@@ -36,5 +40,6 @@ def test_every_picture_has_its_caption(staged: StagedAvatar, tmp_path: Path, mon
     assert {caption: level for caption, level in list(shown.items())[7:] if caption not in ("Layout", light)} == {
         "Photograph, camera 01, frame 4": 5, "Field, 10.0 dB": 10, "Captured look, 20.0 dB": 20,
         "Albedo in its light, 30.0 dB": 30, "Splats, 40.0 dB": 40, "Texture": 50, "Albedo": 60,
+        "White: the 12.5% of texels that no photograph shows, filled by the field": 70,
     }  # fmt: skip
     assert {"Layout", light} <= shown.keys()
