@@ -21,7 +21,7 @@ class FitReport(TypedDict):
     part, not written to the file. silhouette_iou: IoU of the body's silhouette with the masks, null without masks.
     beta: shape values by name. keypoint_offsets_m (25, 3): offset between where the detector and the body model place
     each keypoint. given_poses: how poses that came with the recording were used. on_ground: with one camera, whether
-    world height 0 was taken as the ground."""
+    world height 0 was taken as the ground; doubts: what that camera does not determine."""
 
     seconds: NotRequired[dict[str, float]]
     frames: list[int]
@@ -33,6 +33,7 @@ class FitReport(TypedDict):
     keypoint_offsets_m: list[list[float]]
     given_poses: NotRequired[str]
     on_ground: NotRequired[bool]
+    doubts: NotRequired[list[str]]
 
 
 class ChosenSetting(TypedDict):

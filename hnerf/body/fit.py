@@ -112,6 +112,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         report = _report(capture, masks, observations, pose, fit, seconds)
         if single:
             report["on_ground"] = ground is not None
+            report["doubts"] = _doubts_about_depth(capture.name, posture_prior.single_posture)
             _warn_of_stature(report["stature_m"], settings, capture.stature_m is not None)
         if given_pose:
             report["given_poses"] = given_poses_note(model, capture)
@@ -254,6 +255,20 @@ def _report(
         "beta": dict(zip(pose.rig.beta_names, pose.rig.beta.tolist(), strict=True)),
         "keypoint_offsets_m": pose.offsets_m.tolist(),
     }
+
+
+def _doubts_about_depth(name: str, single_posture: Tensor) -> list[str]:
+    """Return and log in which frames a single camera leaves the depth of limbs open. single_posture (n,) bool: the
+    frames in which all others of their posture determine it."""
+    undetermined, frames = int((~single_posture).sum()), len(single_posture)
+    if not undetermined:
+        return []
+    line = (
+        f"one camera does not determine the depth of limbs in {undetermined} of {frames} frames: that needs a second "
+        "camera, or a person who turns around in one posture"
+    )
+    log.warning("%s: %s", name, line)
+    return [line]
 
 
 def _warn_of_stature(stature_m: float, settings: FitSettings, stated: bool) -> None:

@@ -92,6 +92,11 @@ class PosturePrior:
         held = torch.where(known, math.radians(SINGLE_POSTURE_STD_DEG), self.std)
         return replace(self, std=held) if known.any() else None
 
+    @property
+    def single_posture(self) -> Tensor:
+        """Return the frames that are held to a single posture, (n,) bool."""
+        return self.std.amax(1) <= math.radians(SINGLE_POSTURE_STD_DEG)
+
     def _deviations(self, turns: Tensor) -> Tensor:
         """Return deviations of the turns from their medians, (n, M - 1, 3) radians."""
         off = torch.zeros_like(turns)

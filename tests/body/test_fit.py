@@ -9,6 +9,7 @@ from hnerf.body import contour_fit
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import BodyModel, body_model
 from hnerf.body.fit import (
+    _doubts_about_depth,
     _outlines,
     _report,
     _warn_of_stature,
@@ -61,7 +62,7 @@ def test_four_cameras_recover_pose_and_shape(tmp_path: Path) -> None:
     error_m = joint_error_m(fit, truth)
     assert error_m.mean() < 0.012 and error_m.max() < 0.04
     assert (fit.vertices_m() - truth.vertices_m()).norm(dim=-1).mean() < 0.012
-    assert min(report["silhouette_iou"]) > 0.94 and report["poor_frames"] == []
+    assert min(report["silhouette_iou"]) > 0.94 and report["poor_frames"] == [] and "doubts" not in report
     assert max(report["keypoint_residual_px"]) < 2
     assert abs(report["stature_m"] - float(np.ptp(truth.rig.vertices_m[:, 2].numpy()))) < 0.02
     assert fit.frames == (0, 1, 2) and not fit.theta[:, ~fit.rig.free].any()
@@ -99,10 +100,18 @@ def test_one_camera_finds_the_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     truth, stands, each_foot = moving_body((0, 1, 2, 3)), Ground.add, []
     monkeypatch.setattr(Ground, "add", lambda self, *given: each_foot.append(self.each_foot) or stands(self, *given))
     capture = record(tmp_path, truth, RING, ("0",))
-    fit, _ = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=6))
+    fit, report = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=6))
     assert each_foot == sorted(each_foot) and not each_foot[0] and sum(each_foot) > 6
     assert joint_error_m(fit, truth).mean() < 0.06
     assert fit.vertices_m()[..., 2].min(1).values.mean() < 0.01  # bare feet stand on the ground
+    (doubt,) = report["doubts"]  # the person does not turn around
+    assert doubt.startswith("one camera does not determine the depth of limbs in 4 of 4 frames: ")
+
+
+def test_there_is_no_doubt_about_depth_in_a_single_posture(caplog: pytest.LogCaptureFixture) -> None:
+    assert _doubts_about_depth("ada", torch.tensor([True, True])) == [] and not caplog.records
+    (doubt,) = _doubts_about_depth("ada", torch.tensor([True, False]))
+    assert " in 1 of 2 frames: " in doubt and caplog.messages == [f"ada: {doubt}"]
 
 
 @pytest.mark.usefixtures("few_steps")

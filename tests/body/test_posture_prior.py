@@ -182,6 +182,7 @@ def test_a_single_posture_is_enforced_only_if_the_frames_agree(sway_deg: float, 
     std_rad = (arms - arms.mean(0)).norm(dim=-1).mean()
     assert (std_rad < 1e-3) if held else (std_rad > math.radians(5))
     assert math.isclose(kept.std.rad2deg().max(), 0.1, rel_tol=1e-9) == held
+    assert kept.single_posture.tolist() == [held] * 8
 
 
 def test_a_single_posture_is_recognised_only_from_all_sides() -> None:
@@ -191,6 +192,7 @@ def test_a_single_posture_is_recognised_only_from_all_sides() -> None:
     still = posture_prior.as_single_posture()
     assert still is not None
     torch.testing.assert_close(still.std[[0, 3], 0].rad2deg(), torch.tensor([0.1, 7.0]).double())
+    assert still.single_posture.tolist() == [True] * 3 + [False] * 2
     assert (
         PosturePrior.of_single_view([[0, 1], [2, 3, 4]], turned([0.0] * 5, [0.0] * 5), CAMERA).as_single_posture()
         is None

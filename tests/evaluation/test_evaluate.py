@@ -75,6 +75,7 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
     cameras = {"a": {"status": "ok", "median_px": 0.5}, "b": {"status": "rejected", "median_px": 9.25}}
     findings = {"cameras": cameras, "notes": [HOSTILE], "doubts": ["left and right are exchanged"]}
     (inputs.calibration_folder / "report.json").write_text(json.dumps(findings))
+    (inputs.fit_folder / "report.json").write_text(json.dumps({"doubts": ["limbs have no depth"]}))
     out = base / "subject" / "evaluation"
     out.mkdir(parents=True)
     return base, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=2), out)
@@ -361,7 +362,8 @@ def test_the_report_shows_scores_findings_and_charts(scored: Scored) -> None:
     assert f"{found['novel_view']['psnr']:.2f}" in text
     assert ">3 images, 1 surface<" in text
     assert '<span class="status rejected">' in text and "9.25" in text
-    assert "left and right are exchanged" in text.partition("<nav>")[0]  # doubts are at the top
+    for doubt in ("left and right are exchanged", "limbs have no depth"):
+        assert doubt in text.partition("<nav>")[0]  # doubts are at the top
     assert "a processor" in text and "12.5" in text
     assert 'alt="Losses"' in text and 'alt="Held-out quality"' in text
     lpips = found["novel_view"]["lpips"]
