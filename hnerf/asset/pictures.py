@@ -1,20 +1,29 @@
-"""Images of the asset for its report, drawn from its own arrays: turntable, wireframe, texture; (H, W, 3) uint8 RGB."""
+"""Images of the asset for its report, drawn from its own arrays: turntable, wireframe, joints, texture; (H, W, 3) uint8
+RGB."""
+
+import base64
+import io
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 import trimesh
+from PIL import Image
 
 from hnerf.asset.skeleton import UP
 from hnerf.asset.splat_rendering import render_splats
 from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.staging import StagedAvatar
-from hnerf.evaluation.pictures import SUPERSAMPLING, Shot, normals_at, portrait_camera, shoot, studio_light
+from hnerf.evaluation.pictures import ACCENT, SUPERSAMPLING, Shot, normals_at, portrait_camera, shoot, studio_light
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.rays import RayHits
 
 LINE_PX = 0.7  # width of an edge in a wireframe
+SHIFT = 4  # fractional bits of a pixel's coordinates, as OpenCV draws
+JOINT_PX = 1.6  # radius of a joint
+WEBP_QUALITY = 85
 PAPER, LINE = np.array([236.0, 233, 228]), np.array([47.0, 111, 181])
 
 
@@ -104,8 +113,34 @@ def uv_picture(avatar: StagedAvatar, side_px: int) -> np.ndarray:
     """Draw the faces in the square of texture coordinates, on white."""
     picture = np.full((side_px, side_px, 3), 255, np.uint8)
     corners_px = (avatar.uvs * (1, -1) + (0, 1))[avatar.face_uvs] * side_px - 0.5
-    shift = 4  # fractional bits of a pixel's coordinates
-    fixed = (corners_px * 2**shift).round().astype(np.int32)
+    fixed = _fixed(corners_px)
     for triangle in fixed:  # one by one: in one call, overlapping ones would cancel out
-        cv2.fillConvexPoly(picture, triangle, PAPER.tolist(), cv2.LINE_AA, shift)
-    return cv2.polylines(picture, list(fixed), True, LINE.tolist(), 1, cv2.LINE_AA, shift)
+        cv2.fillConvexPoly(picture, triangle, PAPER.tolist(), cv2.LINE_AA, SHIFT)
+    return cv2.polylines(picture, list(fixed), True, LINE.tolist(), 1, cv2.LINE_AA, SHIFT)
+
+
+def joints_over(picture: np.ndarray, camera: Camera, positions_m: np.ndarray, parents: np.ndarray) -> np.ndarray:
+    """Draw joints at positions_m (J, 3), and lines to their parents (J,), over a camera's image. The root, whose parent
+    is -1, has no line to it: it stands on the ground."""
+    drawn, at = picture.copy(), _fixed(camera.project(positions_m)[0])
+    for joint, parent in enumerate(parents):
+        if parent >= 0 and parents[parent] >= 0:
+            cv2.line(drawn, at[parent], at[joint], LINE.tolist(), 1, cv2.LINE_AA, SHIFT)
+    for joint in at:
+        cv2.circle(drawn, joint, round(JOINT_PX * 2**SHIFT), ACCENT.tolist(), cv2.FILLED, cv2.LINE_AA, SHIFT)
+    return drawn
+
+
+def moving_uri(pictures: Sequence[np.ndarray], each_ms: int) -> str:
+    """Encode images, shown one after another for each_ms in a loop, as the data URI of a WebP file."""
+    first, *others = map(Image.fromarray, pictures)
+    file = io.BytesIO()
+    first.save(
+        file, "WEBP", save_all=True, append_images=others, duration=each_ms, loop=0, quality=WEBP_QUALITY, method=2
+    )
+    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def _fixed(points_px: np.ndarray) -> np.ndarray:
+    """Return pixel coordinates as integers with SHIFT fractional bits."""
+    return (points_px * 2**SHIFT).round().astype(np.int32)

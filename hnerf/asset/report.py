@@ -11,11 +11,12 @@ import numpy as np
 from hnerf.asset.baking import Filled
 from hnerf.asset.comparison import Compared
 from hnerf.asset.extreme_poses import ExtremePose
-from hnerf.asset.pictures import textured, turntable_cameras, uv_picture, wireframe
+from hnerf.asset.pictures import joints_over, moving_uri, textured, turntable_cameras, uv_picture, wireframe
+from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import FRONT
-from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.staging import CAPTURED, StagedAvatar
 from hnerf.evaluation.galleries import GalleryPicture, captioned
-from hnerf.evaluation.pictures import clay, shoot, shrunk
+from hnerf.evaluation.pictures import Shot, clay, shoot, shrunk
 from hnerf.evaluation.report import report_environment
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
@@ -23,7 +24,9 @@ from hnerf.geometry.mesh_queries import Surface
 from hnerf.side_by_side import side_by_side
 
 TEMPLATES = Path(__file__).parent / "page"
-TURNS = 8  # views of the turntable
+STILLS, TURNS = 4, 24  # views of the turntable, as stills and in the image that moves
+MOVING = 0.7  # size of the latter, as a share of the former's
+TURN_MS = 160  # how long it shows a view
 COMPARED = 3  # views shown next to the field's
 SQUARE_PX = 640  # of the layout, and at most of the texture
 
@@ -42,23 +45,27 @@ def write_report(
     """Write the page of an avatar called `name`, shown in the pose of a frame. world_from_body (4, 4): the transform of
     the body, Z up and facing -Y, in that frame; figures: the content of `report.json`."""
     facing = avatar.stage_from_world @ -world_from_body[:3, 1]
-    points_m = avatar.points_m[list(avatar.frames).index(frame)].astype(np.float64)
+    row = list(avatar.frames).index(frame)
+    points_m = avatar.points_m[row].astype(np.float64)
     surface = Surface.of(points_m, avatar.faces)
-    shots = list(side_by_side(partial(shoot, surface), turntable_cameras(points_m, facing, TURNS)))
-    front, back = shots[0], shots[TURNS // 2]
+    shots = list(side_by_side(partial(shoot, surface), turntable_cameras(points_m, facing, STILLS)))
+    front, back = shots[0], shots[STILLS // 2]
+    turns = [camera.scaled(MOVING) for camera in turntable_cameras(points_m, facing, TURNS)]
     page = report_environment(TEMPLATES).get_template("asset.html")
     path.write_text(
         page.render(
             name=name,
             frame=frame,
             has_viewer=(path.parent / "viewer.html").exists(),
-            turntable=[captioned(f"{round(360 * k / TURNS)}°", textured(shot, avatar)) for k, shot in enumerate(shots)],
+            moving=moving_uri(list(side_by_side(partial(_textured, surface, avatar), turns)), TURN_MS),
+            turntable=[captioned(f"{360 * k // STILLS}°", textured(shot, avatar)) for k, shot in enumerate(shots)],
             surface=[
                 captioned("Clay, front", clay(front)),
                 captioned("Clay, back", clay(back)),
                 captioned("Wireframe, front", wireframe(front)),
                 captioned("Wireframe, back", wireframe(back)),
                 *_less_detail(avatar, points_m, front.camera),
+                *(_joints(front, name, rig, row) for name, rig in avatar.rigs.items()),
             ],
             texture=[
                 captioned("Texture", shrunk(avatar.texture, SQUARE_PX)),
@@ -75,6 +82,18 @@ def write_report(
         ),
         encoding="utf-8",
     )
+
+
+def _textured(surface: Surface, avatar: StagedAvatar, camera: Camera) -> np.ndarray:
+    """Render a posed surface of the avatar with its texture, as a camera sees it."""
+    return textured(shoot(surface, camera), avatar)
+
+
+def _joints(shot: Shot, name: str, rig: StagedRig, row: int) -> GalleryPicture:
+    """Return the clay figure with the joints of a rig over it, in the pose of a row of the captured motion."""
+    positions_m = rig.stage(CAPTURED, [row])[0, :, :3, 3]
+    picture = joints_over(clay(shot), shot.camera, positions_m, rig.skeleton.parents)
+    return captioned(f"{name.capitalize()} rig, {len(positions_m)} joints", picture)
 
 
 def _beside_field(view: Compared) -> list[GalleryPicture]:

@@ -1,7 +1,10 @@
+import base64
 import dataclasses
+import io
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hnerf.asset import pictures
 from hnerf.asset.levels import Level
@@ -62,3 +65,31 @@ def test_the_layout_shows_where_faces_lie_in_the_texture(card: StagedAvatar) -> 
     assert layout[10, 32].tolist() == [255, 255, 255]
     assert layout[60, 40].tolist() == pictures.PAPER.tolist()
     assert shrunk(card.texture, 32)[4, 4].tolist() == RED
+
+
+def test_joints_are_drawn_over_the_picture_with_lines_to_their_parents(card: StagedAvatar) -> None:
+    """The root has no line: from the front, it is 282 px below the joint above it."""
+    front = pictures.turntable_cameras(card.points_m[0], FRONT, 4)[0]
+    grey = np.full((400, 300, 3), 200, np.uint8)
+    positions_m = np.array([[0.0, 0, 0], [0, 1, 0], [0.5, 1, 0]])
+    drawn = pictures.joints_over(grey, front, positions_m, np.array([-1, 0, 1]))
+    for point_m in positions_m:
+        column, row = front.project(point_m)[0].round().astype(int)
+        assert drawn[row, column].tolist() == pictures.ACCENT.tolist()
+    row = round(float(front.project(positions_m[1])[0][1]))
+    assert drawn[row, 220, 2] > drawn[row, 220, 0] + 40  # blue
+    assert drawn[200, 150].tolist() == [200, 200, 200]
+    assert np.array_equal(grey, np.full_like(grey, 200))
+
+
+def test_the_moving_picture_shows_its_views_in_turn_without_an_end() -> None:
+    views = [np.full((40, 30, 3), colour, np.uint8) for colour in (RED, GREEN, BLUE)]
+    uri = pictures.moving_uri(views, 160)
+    assert uri.startswith("data:image/webp;base64,")
+    with Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))) as moving:
+        assert moving.info["loop"] == 0  # for ever
+        for k, view in enumerate(views):
+            moving.seek(k)
+            shown = np.asarray(moving.convert("RGB")).astype(int)
+            assert moving.info["duration"] == 160
+            assert np.abs(shown - view).max() < 12

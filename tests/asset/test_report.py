@@ -1,9 +1,12 @@
+import base64
 import dataclasses
+import io
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hnerf.asset import report
 from hnerf.asset.albedo import Albedo
@@ -19,7 +22,8 @@ def grey(level: int, channels: int) -> np.ndarray:
 
 def test_every_picture_has_its_caption(staged: StagedAvatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Textures and renders are each of one grey level; the addresses of pictures are those of their first pixels."""
-    monkeypatch.setattr(report, "TURNS", 2)
+    monkeypatch.setattr(report, "STILLS", 2)
+    monkeypatch.setattr(report, "TURNS", 3)
     monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))
     monkeypatch.setattr("hnerf.evaluation.pictures.data_uri", lambda picture: str(picture[0, 0, 0]))
     assert staged.albedo is not None
@@ -36,10 +40,15 @@ def test_every_picture_has_its_caption(staged: StagedAvatar, tmp_path: Path, mon
     shown = {caption: int(level) for level, caption in re.findall(r'<img src="(\d+)" alt="([^"]*)"', page)}
     light = "Estimated light, +Z in the middle, +X left of it"
     turntable, surface = ["0°", "180°"], ["Clay, front", "Clay, back", "Wireframe, front", "Wireframe, back"]
-    assert list(shown)[:7] == [*turntable, *surface, "lod1, 400 triangles"]
-    assert {caption: level for caption, level in list(shown.items())[7:] if caption not in ("Layout", light)} == {
+    rigs = ["Full rig, 3 joints", "Game rig, 3 joints"]
+    assert list(shown)[:9] == [*turntable, *surface, "lod1, 400 triangles", *rigs]
+    assert {caption: level for caption, level in list(shown.items())[9:] if caption not in ("Layout", light)} == {
         "Photograph, camera 01, frame 4": 5, "Field, 10.0 dB": 10, "Captured look, 20.0 dB": 20,
         "Albedo in its light, 30.0 dB": 30, "Splats, 40.0 dB": 40, "Texture": 50, "Albedo": 60,
         "White: the 12.5% of texels that no photograph shows, filled by the field": 70,
     }  # fmt: skip
     assert {"Layout", light} <= shown.keys()
+    found = re.search(r'srcset="255">\s*<img src="data:image/webp;base64,([^"]*)" alt="The avatar, turning">', page)
+    assert found is not None  # whoever asked for less motion sees the first still
+    with Image.open(io.BytesIO(base64.b64decode(found[1]))) as moving:
+        assert (getattr(moving, "n_frames", 1), moving.size) == (3, (21, 28))
