@@ -282,6 +282,36 @@ def test_another_ground_replaces_the_old_one(page: Page) -> None:
 
 
 @NEEDS_THREE
+def test_the_albedo_is_shown_in_the_pages_light(page: Page) -> None:
+    """With a light of half the strength, only looks that are lit are darker."""
+    page.evaluate("viewer.setTime(0.2)")
+    textured = page.evaluate(PICTURE)
+    page.press("5")
+    assert page.evaluate("document.querySelector('#looks :checked').parentElement.textContent") == "Albedo"
+    albedo = page.evaluate(PICTURE)
+    dimmed = "viewer.stage.scene.traverse((part) => part.isLight && (part.intensity *= %s))"
+    page.evaluate(dimmed % "0.5")
+    darker = page.evaluate(PICTURE)
+    page.press("1")
+    assert page.evaluate(PICTURE) == textured
+    page.evaluate(dimmed % "2")
+    shown = decoded(albedo)[..., 3] > 127
+    assert decoded(darker)[shown, :3].mean() < 0.9 * decoded(albedo)[shown, :3].mean()
+    assert page.evaluate("viewer.looks.materials.Albedo.map.image !== viewer.looks.materials.Textured.map.image")
+
+
+@NEEDS_THREE
+def test_without_an_albedo_the_page_does_not_offer_it(page: Page) -> None:
+    names = page.evaluate(
+        "import('viewer/looks.js').then(({ Looks }) => {"
+        "  const mesh = viewer.avatar.mesh.clone(); mesh.material = viewer.looks.materials.Clay;"
+        "  return new Looks(mesh, null).names;"
+        "})"
+    )
+    assert names == ["Textured", "Clay", "Wireframe", "Weights"]
+
+
+@NEEDS_THREE
 def test_the_rest_pose_moves_no_vertices(page: Page, staged: StagedAvatar) -> None:
     page.evaluate("viewer.setTime(0.2)")
     page.evaluate("viewer.setMotion(viewer.avatar.motions.length)")

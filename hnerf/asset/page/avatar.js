@@ -8,11 +8,13 @@ const GROUND_SAMPLES = 6; // instants of a motion at which its lowest point is s
 
 export class Avatar {
   static async load(bytes) {
-    return new Avatar(await new GLTFLoader().parseAsync(bytes, ""));
+    const gltf = await new GLTFLoader().parseAsync(bytes, "");
+    return new Avatar(gltf, await albedoOf(gltf.parser));
   }
 
-  constructor(gltf) {
+  constructor(gltf, albedo) {
     this.root = gltf.scene;
+    this.albedo = albedo;
     this.motions = gltf.animations;
     this.root.traverse((node) => node.isSkinnedMesh && (this.mesh = node)); // there is one
     this.mesh.frustumCulled = false; // its bounds are those of the rest pose
@@ -111,6 +113,12 @@ export class Avatar {
     for (const joint of this.joints) sum.add(new THREE.Vector3().setFromMatrixPosition(joint.matrixWorld));
     return sum.divideScalar(this.joints.length);
   }
+}
+
+// Returns the texture without the recording's light, or null. It is a material that the mesh does not use by default.
+async function albedoOf(parser) {
+  const index = parser.json.materials.findIndex(({ name }) => name === "Albedo");
+  return index < 0 ? null : (await parser.getDependency("material", index)).map;
 }
 
 // Returns the blend shapes, and whether a motion uses them; those that none uses are expressions and physiques.

@@ -1,17 +1,19 @@
-// How the surface is shown: textured, clay, wireframe, or coloured by the skin weights of a joint.
+// How the surface is shown: textured, clay, wireframe, coloured by the skin weights of a joint, or its albedo in the
+// page's light.
 
 import * as THREE from "three";
 import { influencesOf } from "viewer/influences.js";
 
-export const LOOKS = ["Textured", "Clay", "Wireframe", "Weights"];
 const CLAY = 0xb9b2a8;
 const WIRE = 0x2f6fb5;
 const RAMP = [0x26324a, 0x2a6f97, 0x52b788, 0xf9c74f, 0xe63946].map((c) => new THREE.Color(c)); // weights 0 to 1
 
 export class Looks {
-  constructor(mesh) {
+  // albedo: a texture, or null.
+  constructor(mesh, albedo) {
     this.mesh = mesh;
-    this.materials = materialsOf(mesh.material);
+    this.materials = materialsOf(mesh.material, albedo);
+    this.names = Object.keys(this.materials);
     this.wires = wiresOf(mesh);
     this.show("Textured");
   }
@@ -41,7 +43,7 @@ function ramp(weight) {
   return RAMP[step].clone().lerp(RAMP[step + 1], place - step);
 }
 
-function materialsOf({ map, normalMap, normalScale }) {
+function materialsOf({ map, normalMap, normalScale }, albedo) {
   const pushedBack = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
   const clay = { color: CLAY, normalMap, normalScale, roughness: 0.9 };
   return {
@@ -49,6 +51,7 @@ function materialsOf({ map, normalMap, normalScale }) {
     Clay: new THREE.MeshStandardMaterial(clay),
     Wireframe: new THREE.MeshStandardMaterial({ ...clay, color: 0xe9e6e1, ...pushedBack }),
     Weights: new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 1 }),
+    ...(albedo && { Albedo: new THREE.MeshLambertMaterial({ map: albedo, normalMap, normalScale }) }),
   };
 }
 

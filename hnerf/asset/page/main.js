@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { Avatar } from "viewer/avatar.js";
 import { options, radios, slider } from "viewer/controls.js";
-import { LOOKS, Looks } from "viewer/looks.js";
+import { Looks } from "viewer/looks.js";
 import { Photographs } from "viewer/photographs.js";
 import { Stage } from "viewer/stage.js";
 
@@ -18,7 +18,7 @@ export async function main(bytes, recording) {
     avatar,
     stage,
     recording,
-    looks: new Looks(avatar.mesh),
+    looks: new Looks(avatar.mesh, avatar.albedo),
     photographs: new Photographs(find("photograph"), find("caption"), recording.fps),
     skeleton: new THREE.SkeletonHelper(avatar.root),
     axes: new THREE.AxesHelper(0.15),
@@ -115,8 +115,8 @@ function showTime({ avatar, recording }) {
 
 function connectLooks(viewer) {
   const { looks, stage } = viewer;
-  viewer.choose.look = radios(find("looks"), LOOKS, (index) => {
-    looks.show(LOOKS[index]);
+  viewer.choose.look = radios(find("looks"), looks.names, (index) => {
+    looks.show(looks.names[index]);
     viewer.changed = true;
   });
   const shown = { skeleton: [viewer.skeleton, viewer.axes], grid: [stage.grid] };
@@ -231,7 +231,7 @@ function connectKeys(viewer) {
       stage.frame({ ...viewer.bounds, ...avatar.present() });
     },
   };
-  LOOKS.forEach((_, index) => (keys[index + 1] = () => viewer.choose.look(index)));
+  viewer.looks.names.forEach((_, index) => (keys[index + 1] = () => viewer.choose.look(index)));
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const { tagName, type } = event.target;
