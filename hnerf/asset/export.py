@@ -127,7 +127,7 @@ def export_asset(
         write_files(out, avatars, capture, info, splats)
         write_image(out / "filled.png", asset.filled.mask)
     with timed("viewer", seconds, log):
-        viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
+        viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world, staged.levels)
     with timed("validation", seconds, log):
         interfaces = ["avatar.usda", "avatar_materialx.usda", *(f"avatar_{rate}.usda" for rate in staged.rates)]
         packages = ["avatar.usdz", *interfaces, "avatar_cache.usdz", *([SPLATS] if splats else [])]

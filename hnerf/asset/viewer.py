@@ -1,6 +1,7 @@
 """The page on which anyone can turn the avatar: one HTML file that works offline and makes no network requests.
 
-It carries avatar.glb, photographs of the recording, three.js and the modules under `page/`, which do the work.
+It carries avatar.glb, lower levels of detail, photographs of the recording, three.js and the modules under `page/`,
+which do the work.
 """
 
 import base64
@@ -8,12 +9,14 @@ import gzip
 import json
 import logging
 import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hnerf.asset.compact_glb import compact_glb
+from hnerf.asset.levels import Level
 from hnerf.asset.staging import opengl_pose
 from hnerf.capture.capture import Capture
 from hnerf.errors import InputError
@@ -34,12 +37,12 @@ RELATIVE_IMPORT = re.compile(r"from '\.{1,2}/(?:[\w./]*/)?([\w.]+\.js)'")  # as 
 log = logging.getLogger("hnerf.asset")
 
 
-def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.ndarray) -> str:
+def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.ndarray, levels: Sequence[Level]) -> str:
     """Write the page of an avatar. Return its name, or, if it cannot be written, the reason in one line, which is
     logged, too.
 
-    stage_from_world (3, 3): from the capture's world to the avatar's. The texture is halved until the page has at most
-    MAX_BYTES; if that does not suffice, a warning is logged.
+    stage_from_world (3, 3): from the capture's world to the avatar's; levels: of detail, the first that of the file.
+    The texture is halved until the page has at most MAX_BYTES; if that does not suffice, a warning is logged.
     """
     try:
         modules = _modules()
@@ -53,6 +56,7 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
         "boot": (PAGE / "boot.js").read_text(encoding="utf-8"),
         "licence": (LICENCES / "three.txt").read_text(encoding="utf-8"),
         "modules": _packed(json.dumps(modules).encode()),
+        "levels": _packed(json.dumps(lower_indices(levels)).encode()),
         "recording": _packed(json.dumps(recording(capture, stage_from_world)).encode()),
     }
     template = report_environment(PAGE).get_template("viewer.html")
@@ -91,6 +95,21 @@ def recording(capture: Capture, stage_from_world: np.ndarray) -> dict[str, Any]:
             for name in names
         ],
     }
+
+
+def lower_indices(levels: Sequence[Level]) -> list[list[int]]:
+    """Return the triangles of each level of detail below the first, as indices into the vertices of avatar.glb: those
+    of the first, one for each row of its texture coordinates."""
+    row_of = {corner: row for level in levels[:1] for corner, row in _corners(level)}
+    return [[row_of[corner] for corner, _ in _corners(level)] for level in levels[1:]]
+
+
+def _corners(level: Level) -> Iterator[tuple[tuple[int, float, float], int]]:
+    """Yield the vertex and the texture coordinates of each corner of a level's faces, and the row of the latter."""
+    rows = level.layout.face_uvs.ravel()
+    vertices, uvs = level.vertices[level.faces.ravel()].tolist(), level.layout.uvs[rows].tolist()
+    for vertex, (u, v), row in zip(vertices, uvs, rows.tolist(), strict=True):
+        yield (vertex, u, v), row
 
 
 def _camera(camera: Camera, stage_from_world: np.ndarray) -> dict[str, Any]:

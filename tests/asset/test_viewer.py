@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from hnerf.asset.compact_glb import read_glb
 from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
-from hnerf.asset.viewer import MAX_BYTES, _modules, recording, write_viewer
+from hnerf.asset.viewer import MAX_BYTES, _modules, lower_indices, recording, write_viewer
 from hnerf.capture.capture import Capture
 from hnerf.evaluation.pictures import cast_pixels
 from hnerf.geometry.mesh_queries import Surface
@@ -52,7 +52,7 @@ def viewer(staged: StagedAvatar, photographed: Capture, tmp_path_factory: pytest
     full = dataclasses.replace(full, motions=full.motions | {"fast": fast})
     write_glb(glb, staged, full)
     glb.write_bytes(with_joints_in_second_set(glb.read_bytes()))
-    written = write_viewer(folder / "viewer.html", glb, photographed, staged.stage_from_world)
+    written = write_viewer(folder / "viewer.html", glb, photographed, staged.stage_from_world, staged.levels)
     assert written == "viewer.html"
     return folder / "viewer.html"
 
@@ -77,7 +77,7 @@ def test_without_intact_three_js_a_reason_is_given_and_no_page_is_written(
     monkeypatch.setenv("HNERF_MODELS", str(models))
     page = tmp_path / "viewer.html"
     for found in ("not there", "altered or damaged"):
-        reason = write_viewer(page, tmp_path / "avatar.glb", capture(), staged.stage_from_world)
+        reason = write_viewer(page, tmp_path / "avatar.glb", capture(), staged.stage_from_world, [])
         assert reason == f"no viewer.html: {models}/{next(iter(THREE_SHA256))}: {found}; run `hnerf models`"
         models.mkdir(exist_ok=True)
         (models / next(iter(THREE_SHA256))).write_text("// an older version")
@@ -97,6 +97,15 @@ def test_cameras_and_photographs_are_in_the_avatars_world(photographed: Capture,
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (288, 384, 3)
     assert abs(int(image[100, 100, 0]) - 65) <= 1
+
+
+def test_lower_levels_of_detail_are_triangles_of_the_files_vertices(staged: StagedAvatar) -> None:
+    """The file has a vertex for each row of the first level's texture coordinates."""
+    lower, (level,) = staged.levels[1], lower_indices(staged.levels)
+    vertex_of_row = np.zeros(len(staged.uvs), int)
+    vertex_of_row[staged.face_uvs] = staged.faces
+    assert np.array_equal(vertex_of_row[level], lower.vertices[lower.faces.ravel()])
+    assert np.array_equal(staged.uvs[level], lower.layout.uvs[lower.layout.face_uvs.ravel()])
 
 
 @NEEDS_THREE
@@ -119,12 +128,13 @@ def test_a_page_is_packed_once_per_texture_size(
     monkeypatch.setattr("hnerf.asset.viewer._packed", lambda content: packed.append(content) or "")
     monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", 1)
     monkeypatch.setattr("hnerf.asset.viewer.TEXTURES_PX", (256, 128, 64, 32, 16))
-    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
+    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3), [])
     assert [content[:4] for content in packed].count(b"glTF") == 3
 
 
 @NEEDS_THREE
 def test_a_page_that_is_too_large_gets_a_smaller_texture(
+    staged: StagedAvatar,
     viewer: Path,
     photographed: Capture,
     tmp_path: Path,
@@ -133,7 +143,7 @@ def test_a_page_that_is_too_large_gets_a_smaller_texture(
 ) -> None:
     monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", viewer.stat().st_size - 1)
     monkeypatch.setattr("hnerf.asset.viewer.TEXTURES_PX", (64, 16, 8))
-    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
+    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3), staged.levels)
     packed = re.search(r'id="packed-avatar">(.*?)<', (tmp_path / "viewer.html").read_text())
     assert packed is not None
     document, binary = read_glb(gzip.decompress(base64.b64decode(packed[1])))
@@ -141,7 +151,7 @@ def test_a_page_that_is_too_large_gets_a_smaller_texture(
     jpeg = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
     assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (16, 16, 3)
     monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", 1)
-    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
+    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3), [])
     assert "viewer.html: over 0 MB even with a small texture: the motion is long or the mesh fine" in caplog.text
 
 
@@ -279,6 +289,24 @@ def test_another_ground_replaces_the_old_one(page: Page) -> None:
     before = page.evaluate(geometries)
     page.evaluate("viewer.stage.drawGround()")
     assert page.evaluate(geometries) == before
+
+
+@NEEDS_THREE
+def test_lower_levels_of_detail_are_drawn_in_every_look(page: Page) -> None:
+    page.evaluate("viewer.setTime(0.2), viewer.stage.grid.visible = false")
+    names = page.evaluate("[...document.getElementById('level').options].map(({ text }) => text)")
+    assert names == ["lod0, 816 triangles", "lod1, 400 triangles"]
+    drawn = "(viewer.stage.render(), viewer.stage.renderer.info.render)"
+    for look, count in (("0", f"{drawn}.triangles"), ("2", f"{drawn}.lines")):
+        page.evaluate(f"viewer.choose.look({look})")
+        finest, picture = page.evaluate(count), page.evaluate(PICTURE)
+        page.evaluate(move("#level", 1, "change"))
+        assert page.evaluate(count) == pytest.approx(finest * 400 / 816)
+        assert page.evaluate(PICTURE) != picture
+        page.evaluate(move("#level", 0, "change"))
+        assert page.evaluate(count) == finest
+        assert page.evaluate(PICTURE) == picture
+    page.evaluate("viewer.choose.look(0)")
 
 
 @NEEDS_THREE

@@ -30,6 +30,19 @@ export class Avatar {
     this.animated = this.snapshot();
   }
 
+  // Adds lower levels of detail: triangles of some of the vertices, as lists of indices.
+  addLevels(lower) {
+    const added = lower.map((indices) => new THREE.BufferAttribute(new Uint32Array(indices), 1));
+    this.levels = [this.mesh.geometry.index, ...added];
+  }
+
+  showLevel(level) {
+    const { geometry } = this.mesh;
+    const { version } = geometry.index;
+    geometry.setIndex(this.levels[level]);
+    geometry.index.version = version + 1; // the wireframe's lines are drawn anew only for a later version
+  }
+
   // Plays a motion; null is the rest pose.
   setMotion(motion) {
     this.restore();

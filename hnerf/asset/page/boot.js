@@ -17,7 +17,10 @@ async function start() {
   document.head.append(map);
   const { main } = await import("viewer/main.js");
   const avatar = await (await unpacked("packed-avatar")).arrayBuffer();
-  await main(avatar, await (await unpacked("packed-recording")).json());
+  const [recording, levels] = await Promise.all(
+    ["packed-recording", "packed-levels"].map(async (id) => (await unpacked(id)).json()),
+  );
+  await main(avatar, recording, levels);
 }
 
 start().catch((error) => {

@@ -11,8 +11,9 @@ const REST = "Rest pose";
 const MARGIN_FRAMES = 0.01; // after the time slider's last frame, which rounding to floats may put past the end
 const find = (id) => document.getElementById(id);
 
-export async function main(bytes, recording) {
+export async function main(bytes, recording, levels) {
   const avatar = await Avatar.load(bytes);
+  avatar.addLevels(levels);
   const stage = new Stage(find("canvas"), find("photograph"));
   const viewer = {
     avatar,
@@ -28,6 +29,7 @@ export async function main(bytes, recording) {
   stage.scene.add(avatar.root, viewer.skeleton);
   connectMotion(viewer);
   connectLooks(viewer);
+  connectLevels(viewer);
   viewer.choose.camera = connectCameras(viewer);
   connectJoints(viewer);
   connectShapes(viewer);
@@ -128,6 +130,16 @@ function connectLooks(viewer) {
     find(id).addEventListener("change", show);
     show();
   }
+}
+
+function connectLevels(viewer) {
+  const { levels } = viewer.avatar;
+  options(find("level"), levels.map((index, k) => `lod${k}, ${index.count / 3} triangles`));
+  find("level").hidden = levels.length === 1;
+  find("level").addEventListener("change", (event) => {
+    viewer.avatar.showLevel(Number(event.target.value));
+    viewer.changed = true;
+  });
 }
 
 function connectCameras(viewer) {
