@@ -17,6 +17,7 @@ REGIONS = {  # by prefixes of joint names; all other joints belong to the torso
     "legs": ("upperleg", "lowerleg"),
     "feet": ("foot", "toe"),
 }
+UNCLOTHED = ("hands", "feet")  # the captured mesh would be no gain for these alone
 LIMIT_MM = 10.0  # of the 95th percentile in a region: thick cloth stands about this far from the skin
 
 Distances = dict[str, dict[str, float]]
@@ -47,14 +48,15 @@ def chosen_topology(wanted: str, registered_mm: Distances) -> str:
     """Return the topology of the asset's first mesh. wanted: `asset.topology`; registered_mm: the distances of the
     registered mesh."""
     if wanted == "auto":
-        return "captured" if _not_followed(registered_mm) else "registered"
+        return "captured" if set(_not_followed(registered_mm)) - set(UNCLOTHED) else "registered"
     return "registered" if wanted == "both" else wanted
 
 
 def findings(wanted: str, registered_mm: Distances) -> list[str]:
     """Return a line for each region in which the registered mesh does not follow the surface, unless the captured mesh
     was asked for. wanted, registered_mm: see `chosen_topology`."""
-    captured = "The asset has the captured mesh" if wanted == "auto" else "asset.topology=captured follows them"
+    falls_back = wanted == "auto" and chosen_topology(wanted, registered_mm) == "captured"
+    captured = "The asset has the captured mesh" if falls_back else "asset.topology=captured follows them"
     return [
         f"{region}: 5 % of the surface is more than {registered_mm[region]['p95']:.0f} mm from the registered mesh; "
         f"loose clothes or long hair? {captured}"

@@ -63,3 +63,11 @@ def test_only_auto_falls_back_to_the_captured_mesh(wanted: str, chosen: str) -> 
 
 def test_mean_and_95th_percentile() -> None:
     assert _summary(np.append(np.arange(100.0), 1050)) == {"mean": pytest.approx(6000 / 101), "p95": 95}
+
+
+def test_hands_and_feet_alone_do_not_exchange_the_mesh() -> None:
+    over = {"mean": 1.0, "p95": LIMIT_MM + 0.1}
+    assert chosen_topology("auto", {"hands": over, "feet": over}) == "registered"
+    assert chosen_topology("auto", {"hands": over, "head": over}) == "captured"
+    (line,) = findings("auto", {"hands": over})
+    assert line.endswith("asset.topology=captured follows them")
