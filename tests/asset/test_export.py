@@ -94,7 +94,7 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
     # In frame 3 the body, which faces -Y, is turned by 2.4 rad about Z: to (sin, -cos, 0), in the stage (sin, 0, cos).
     np.testing.assert_allclose(shown_from[0], [np.sin(2.4), 0, np.cos(2.4)], atol=1e-6)
     assert report["viewer"] in page and 'href="viewer.html"' not in page
-    assert page.count("<img") == 2 + 5 + 2 + 2 + 3  # turntable, surface, an expression, a physique, texture
+    assert page.count("<img") == 1 + 2 + 7 + 2 + 2 + 3  # turning, stills, surface, an expression, a physique, texture
     assert report["expressions"] == ["frown"] and report["physiques"] == ["stout"]
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
