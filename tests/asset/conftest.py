@@ -94,5 +94,6 @@ def both(staged: StagedAvatar, captured: StagedAvatar, tmp_path_factory: pytest.
 def small_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make reports with few and small images, and without a viewer, because the capture has no pixels."""
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
+    monkeypatch.setattr("hnerf.asset.report.STILLS", 2)
     monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
     monkeypatch.setattr("hnerf.evaluation.pictures.PICTURE_PX", (30, 40))
