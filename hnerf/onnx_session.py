@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, one_line
 
 
 def open_session(path: Path, setting: str, threads: int = 0) -> Any:
@@ -32,8 +32,3 @@ def outputs_of(session: Any, path: Path, values: np.ndarray, advice: str) -> lis
         return list(session.run(None, {session.get_inputs()[0].name: values}))
     except Exception as error:  # as above
         raise InputError(f"{path}: does not run on {values.shape}: {one_line(error)}; {advice}") from None
-
-
-def one_line(error: Exception) -> str:
-    """Return the message of an error without line breaks."""
-    return " ".join(str(error).split())
