@@ -47,8 +47,12 @@ def view_subject(subject: Path, motions: Sequence[Path], host: str, port: int) -
 
 
 def live_person(subject: Path, motions: Sequence[Path], capture: Capture) -> LivePerson:
-    """Return the subject's avatar in its captured motion and in others, each called by its file's name."""
+    """Return the subject's avatar in its captured motion and in others, each called by its file's name. Raises
+    InputError if two have the same name."""
     options = {CAPTURED: RenderOptions()} | {path.name: RenderOptions(motion=path) for path in motions}
+    if len(options) <= len(motions):
+        names = ", ".join(path.name for path in motions)
+        raise InputError(f"--motion {names}: each needs a name of its own, other than {CAPTURED}; rename the files")
     return LivePerson(avatar_of(subject), {name: chosen_motion(subject, one, capture) for name, one in options.items()})
 
 

@@ -14,6 +14,7 @@ import pytest
 
 from flows.cli import main
 from hnerf.avatar.trained import load_avatar
+from hnerf.errors import InputError
 from hnerf.render.page import Page, live_person
 from hnerf.render.subject import RenderOptions, checked_capture
 
@@ -108,6 +109,11 @@ def test_a_turn_belongs_to_its_joint_and_is_reset(page: Page) -> None:
 
 def test_a_motion_of_another_subject_is_offered(page: Page, subject: Path) -> None:
     assert list(page._person.motions) == ["captured", subject.name]
+
+
+def test_two_motions_of_the_same_name_are_refused(subject: Path) -> None:
+    with pytest.raises(InputError, match=r"--motion column, column: each needs a name of its own"):
+        live_person(subject, [subject, subject], checked_capture(subject, RenderOptions()))
 
 
 def quaternion_of(rotation: np.ndarray) -> np.ndarray:
