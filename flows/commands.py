@@ -229,11 +229,8 @@ def _show(table: Path) -> None:
 def render(options: argparse.Namespace) -> None:
     """Render images and video of a trained person."""
     from hnerf.render.subject import RenderOptions, render_subject
-    from tasks.store import require_intact
 
-    for subject in (options.subject, options.motion):
-        if subject and subject.is_dir():
-            require_intact(subject)
+    _require_intact(options.subject, [options.motion] if options.motion else [])
     wanted = RenderOptions(
         camera=options.camera,
         path=options.path,
@@ -254,10 +251,8 @@ def render(options: argparse.Namespace) -> None:
 def view(options: argparse.Namespace) -> None:
     """Show a trained person in a browser, rendered live in any view, pose and shape; needs the extra `view`."""
     from hnerf.render.page import view_subject
-    from tasks.store import require_intact
 
-    for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
-        require_intact(folder)
+    _require_intact(options.subject, options.motion)
     view_subject(options.subject, options.motion, options.host, options.port)
 
 
@@ -265,16 +260,23 @@ def export(options: argparse.Namespace) -> None:
     """Export the asset of a trained person again, with other settings or more motions."""
     _check_section(options, "asset")
     from hnerf.asset.subject import export_subject
-    from tasks.store import recording_digest, require_intact
+    from tasks.store import recording_digest
 
-    for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
-        require_intact(folder)
+    _require_intact(options.subject, options.motion)
     allowed = ["asset.allow_poor=true"] if options.allow_poor else []
     settings = load_settings(options.preset, options.overrides + allowed).asset
     digest = recording_digest(options.subject)
     report = export_subject(options.subject, settings, options.motion, options.out, digest, options.blender)
     motions = ", ".join(f"{name} ({m['poses']} poses)" for name, m in report["motions"].items())
     print(f"motions: {motions}\nasset: {options.out / 'avatar.usda'}")
+
+
+def _require_intact(subject: Path, motions: list[Path]) -> None:
+    """Raise InputError if results of a subject, or of one whose motion is shown, were changed."""
+    from tasks.store import require_intact
+
+    for folder in (subject, *(motion for motion in motions if motion.is_dir())):
+        require_intact(folder)
 
 
 def _shape_changes(texts: list[str]) -> dict[str, float]:
