@@ -245,19 +245,21 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
     person.add_argument("--fov", type=number(float, 1, 170), metavar="DEG", help=what)
 
 
+def _add_subject(command: argparse.ArgumentParser, verb: str) -> None:
+    command.add_argument("subject", type=path, help=FOLDERS["subject"])
+    what = f"{verb} this motion: {MOTIONS}"
+    command.add_argument("--motion", type=path, action="append", default=[], metavar="FILE", help=what)
+
+
 def _add_view(view: argparse.ArgumentParser) -> None:
-    view.add_argument("subject", type=path, help=FOLDERS["subject"])
-    what = f"offer this motion, too: {MOTIONS}"
-    view.add_argument("--motion", type=path, action="append", default=[], metavar="FILE", help=what)
+    _add_subject(view, "offer")
     what = "address to serve at; 0.0.0.0 lets the whole network see the person (default: 127.0.0.1)"
     view.add_argument("--host", default="127.0.0.1", help=what)
     view.add_argument("--port", type=number(int, 1, 65535), default=8080, help="port to serve at (default: 8080)")
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
-    export.add_argument("subject", type=path, help=FOLDERS["subject"])
-    what = f"add this motion: {MOTIONS}"
-    export.add_argument("--motion", type=path, action="append", default=[], metavar="FILE", help=what)
+    _add_subject(export, "add")
     what = "add FBX and Alembic; PROGRAM is Blender, or a Python that has bpy"
     export.add_argument("--blender", metavar="PROGRAM", help=what)
     what = "accept an asset that is more than 4 dB below its field"
