@@ -303,6 +303,7 @@ FAULTS = (
     Fault("segmentation-grey-videos", "segmentation/difference", "MAX_GREY_SPREAD = 6", "MAX_GREY_SPREAD = 0",
           seen_by="segmentation/segment"),
     Fault("masks-by-file", "capture/ingest", "return _write_masks(normaliser, masks, out, soft=True)", "soft = True"),
+    Fault("hdr-transfer", "capture/video_metadata", "colour[6:8]", "colour[4:6]", "capture/ingest"),
     Fault("focal-of-tracks", "capture/video_metadata", "movie + tracks", "movie", "capture/uncalibrated"),
     Fault("estimated-lens", "capture/uncalibrated", " if self.lens_file or not lens.estimated", ""),
     Fault("normalise-keypoints", "capture/normalise", "* scale + (scale - 1) / 2", "* scale", "capture/ingest"),

@@ -12,7 +12,7 @@ from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import KEYPOINTS, Capture, SubjectPoint
 from hnerf.capture.clocks import InStep, in_step, read_clocks, warn_if_uneven
-from hnerf.capture.footage import Footage, VideoFrame
+from hnerf.capture.footage import Footage, Video, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
 from hnerf.capture.formats.easymocap import EasyMocap
@@ -45,6 +45,7 @@ from hnerf.capture.safe_io import (
 from hnerf.capture.subset import write_points
 from hnerf.capture.timing import median_step
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
+from hnerf.capture.video_metadata import is_hdr
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
@@ -98,6 +99,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     footage = in_step(filmed, clocks, manifest.fps or DEFAULT_FPS)
     if len(filmed) == 1 and not uncalibrated:
         warn_if_uneven(*filmed.values())
+    _warn_of_hdr(filmed)
     recorded, fps = _common_frames(footage), _frame_rate(folder, manifest.fps, filmed, footage)
     _check_subject(folder, manifest, {name: {*recorded, *filmed[name].frames} for name in cameras.train})
     detected = {name: detections(layout, name, one.source) for name, one in footage.items()}
@@ -199,6 +201,11 @@ def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
     if (point := manifest.subject_point) and (not point.camera or layout.only not in (None, point.camera)):
         dropped.add("subject")
     return manifest.model_copy(update=dict.fromkeys(dropped))
+
+
+def _warn_of_hdr(filmed: dict[str, Footage]) -> None:
+    for path in (one.path for one in filmed.values() if isinstance(one, Video) and is_hdr(one.path)):
+        log.warning("%s: colours of HDR video are read as Rec. 709, and look wrong; convert them, or record SDR", path)
 
 
 def _warn_of_unread(folder: Path, places: tuple[str, ...], expected: set[str]) -> None:

@@ -1,5 +1,5 @@
-"""Focal lengths in the metadata of images (EXIF) and of videos (boxes of MP4 and QuickTime), and mirror images in the
-latter."""
+"""Focal lengths in the metadata of images (EXIF) and of videos (boxes of MP4 and QuickTime); mirror images and high
+dynamic range in the latter."""
 
 import struct
 from pathlib import Path
@@ -12,6 +12,8 @@ from hnerf.capture.safe_io import VIDEO_SUFFIXES
 EXIF_IFD, EXIF_FOCAL_35MM = 0x8769, 0xA405
 KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 MAX_METADATA_BYTES = 16_000_000
+STSD_HEADER_BYTES, VIDEO_ENTRY_BYTES = 8, 78  # before the inner boxes (ISO/IEC 14496-12, 8.5.2 and 12.1.3)
+HDR_TRANSFERS = (16, 18)  # transfer characteristics of PQ and HLG (ISO/IEC 23091-2)
 # `struct` formats of QuickTime's well-known types 21 (signed), 22 (unsigned), 23 and 24 (floats), by number of bytes.
 FORMATS = {(21, 1): ">b", (21, 2): ">h", (21, 4): ">i", (22, 1): ">B", (22, 2): ">H", (22, 4): ">I", (23, 4): ">f",
            (24, 8): ">d"}  # fmt: skip
@@ -31,14 +33,29 @@ def opencv_inverts(path: Path) -> bool:
     """Return whether OpenCV turns a video upside down: one to be shown mirrored, as front cameras may state, and not
     also on its side. It reads such a matrix in `tkhd` as the nearest rotation, by 0 instead of 180 degrees or the other
     way round."""
-    for kind, content in movie_boxes(path, MAX_METADATA_BYTES):
-        track = dict(boxes(content)) if kind == b"trak" else {}
-        handler = dict(boxes(track.get(b"mdia", b""))).get(b"hdlr", b"")
-        if handler[8:12] == b"vide" and (header := track.get(b"tkhd", b"")):
-            matrix = header[52:] if header[0] else header[40:]  # with 64 or 32-bit times
-            a, b, _, c, d = struct.unpack_from(">5i", matrix.ljust(20, bytes(1)))
-            return bool(a * d < b * c and abs(a) > abs(b))
-    return False
+    header = _picture_track(path).get(b"tkhd", b"")
+    if not header:
+        return False
+    matrix = header[52:] if header[0] else header[40:]  # with 64 or 32-bit times
+    a, b, _, c, d = struct.unpack_from(">5i", matrix.ljust(20, bytes(1)))
+    return bool(a * d < b * c and abs(a) > abs(b))
+
+
+def is_hdr(path: Path) -> bool:
+    """Return whether a video states high dynamic range (`colr`: HLG or PQ), the default of many phones. OpenCV decodes
+    its values as if they were Rec. 709."""
+    inner = _picture_track(path)
+    for kind in (b"mdia", b"minf", b"stbl"):
+        inner = dict(boxes(inner.get(kind, b"")))
+    entries = boxes(inner.get(b"stsd", b"")[STSD_HEADER_BYTES:])
+    described = [dict(boxes(content[VIDEO_ENTRY_BYTES:])).get(b"colr", b"") for _, content in entries]
+    return any(int.from_bytes(colour[6:8], "big") in HDR_TRANSFERS for colour in described)
+
+
+def _picture_track(path: Path) -> dict[bytes, bytes]:
+    """Return the boxes of a file's first track of pictures by kind; none without one."""
+    tracks = (dict(boxes(content)) for kind, content in movie_boxes(path, MAX_METADATA_BYTES) if kind == b"trak")
+    return next((t for t in tracks if dict(boxes(t.get(b"mdia", b""))).get(b"hdlr", b"")[8:12] == b"vide"), {})
 
 
 def _of_image(path: Path) -> float | None:

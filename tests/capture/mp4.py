@@ -75,6 +75,18 @@ def trim(path: Path, *edits: tuple[int | None, int], wide: bool = False) -> None
     _edit(path, b"elst", lambda _: struct.pack(">II", wide << 24, len(edits)) + b"".join(listed))
 
 
+def state_transfer(path: Path, transfer: int) -> None:
+    """Make a video state the transfer characteristics of its colours, as `colr`."""
+
+    def coloured(content: bytes) -> bytes:
+        size, kind = struct.unpack(">I4s", content[8:16])
+        return content[:8] + box(
+            kind, content[16 : 8 + size] + box(b"colr", b"nclx" + struct.pack(">HHHB", 9, transfer, 9, 0))
+        )
+
+    _edit(path, b"stsd", coloured)
+
+
 def declare_samples(path: Path, count: int) -> None:
     """Make a video declare this many samples of one byte each."""
     _edit(path, b"stsz", lambda _: struct.pack(">III", 0, 1, count))

@@ -14,6 +14,7 @@ from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from tests.capture import recordings as rec
+from tests.capture.mp4 import state_transfer, write_video
 from tests.shared_data import shared_capture
 
 SETTINGS = CaptureSettings()
@@ -74,6 +75,14 @@ def test_capture_toml_sets_names_and_splits(folder: Path, tmp_path: Path) -> Non
     assert (capture.train_cameras, capture.test_cameras) == (("02",), ("01",))
     assert (capture.train_frames, capture.novel_pose_frames, capture.frames) == ((1, 3), (4,), (1, 3, 4))
     assert {p.name[:6] for p in (tmp_path / "out" / "images" / "01").iterdir()} == {"000001", "000003", "000004"}
+
+
+@pytest.mark.parametrize(("transfer", "warns"), {"Rec. 709": (1, False), "PQ": (16, True), "HLG": (18, True)}.values())
+def test_hdr_video_gets_a_warning(transfer: int, warns: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_video(tmp_path / "film" / "a.mp4", [10, 20, 30])
+    state_transfer(tmp_path / "film" / "a.mp4", transfer)
+    ingest(tmp_path / "film", CaptureSettings(), tmp_path / "out")
+    assert ("a.mp4: colours of HDR video" in caplog.text) == warns
 
 
 def test_files_of_uncalibrated_cameras_get_a_warning(
