@@ -6,6 +6,7 @@ from datetime import timedelta
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
 
 PATIENCE = timedelta(hours=12)  # of processes that wait while one gathers pixels; the stage's own limit ends a hang
 
@@ -37,6 +38,12 @@ class Distributed:
         found = torch.tensor(value, dtype=torch.float64, device=self.device)
         dist.all_reduce(found, dist.ReduceOp.MAX)
         return float(found)
+
+    def all_sum(self, values: Tensor) -> Tensor:
+        """Return the sum of the tensors of all processes, which it may overwrite."""
+        if self.world_size > 1:
+            dist.all_reduce(values)
+        return values
 
     def barrier(self) -> None:
         """Block until every process has reached this call."""

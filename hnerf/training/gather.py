@@ -16,18 +16,17 @@ from hnerf.geometry.reach import ReachablePixels
 from hnerf.segmentation.edge import shaded_plate
 from hnerf.segmentation.prior import bounding_window
 from hnerf.training.distributed import Distributed
-from hnerf.training.pixels import Pixels
+from hnerf.training.pixels import CELL_PX, Pixels
 from hnerf.training.plates import plates_of
 
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and background
 SUFFIX = ".pixels"  # of the files that hold the columns of Pixels; COLUMNS: the columns' types and widths
 COLUMNS = {
     "starts": (torch.int64, 1),
-    "edges": (torch.int64, 1),
-    "edge_starts": (torch.int64, 1),
     "image_starts": (torch.int64, 1),
     "image_camera": (torch.int64, 1),
     "pixel_index": (torch.int32, 1),
+    "cell": (torch.int32, 1),
     "colour": (torch.uint8, 3),
     "plate": (torch.uint8, 3),
     "person": (torch.bool, 1),
@@ -84,9 +83,8 @@ def _write_pixels(
     """Write the columns of Pixels, one file each, frame by frame."""
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     plates = plates_of(capture, masks, body.frames) if visible_pixels else None
-    columns = _Columns(folder)
+    columns, cells = _Columns(folder), 0
     for frame, vertices_m in zip(body.frames, body.vertices_m().numpy(), strict=True):
-        edges = [np.zeros(0, bool)]
         for c, camera in enumerate(cameras):
             if (camera.name, frame) not in masks:
                 continue
@@ -97,21 +95,20 @@ def _write_pixels(
                 if plates:
                     wanted &= plates[c].known | ~edge  # at other edges, the person's share is unknown
                 columns.append("pixel_index", np.flatnonzero(wanted))
+                y, x = np.nonzero(wanted)
+                met, cell = np.unique(y // CELL_PX * wanted.shape[1] + x // CELL_PX, return_inverse=True)
+                columns.append("cell", cells + cell)
+                cells += len(met)
             columns.append("colour", _exposure_corrected(image[wanted], gain))
             columns.append("person", mask[wanted])
-            edges.append(edge[wanted])
-            columns.append("edge", edges[-1])
+            columns.append("edge", edge[wanted])
             columns.append("image_camera", [c])
-            columns.close("image_starts", len(edges[-1]))
+            columns.close("image_starts", int(wanted.sum()))
             if plates and wanted.any():
                 window = bounding_window(wanted)
                 shaded = shaded_plate(mask[window], image[window], plates[c].colour[window])[wanted[window]]
                 columns.append("plate", _exposure_corrected(shaded.clip(0, 255).round().astype(np.uint8), gain))
-        every = np.concatenate(edges)
-        mixed = np.flatnonzero(every) if every.any() else np.arange(len(every))
-        columns.append("edges", columns.ends["starts"] + mixed)
-        columns.close("edge_starts", len(mixed))
-        columns.close("starts", len(every))
+        columns.close("starts", columns.ends["image_starts"] - columns.ends["starts"])
 
 
 class _Columns:
@@ -119,7 +116,7 @@ class _Columns:
     of starts."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.ends = folder, {"starts": 0, "edge_starts": 0, "image_starts": 0}
+        self.folder, self.ends = folder, {"starts": 0, "image_starts": 0}
         for name in self.ends:
             self.close(name, 0)
 

@@ -38,9 +38,9 @@ def box_colour(samples: RaySamples) -> Float[Tensor, "R 3"]:
     return pixel_colour(samples.in_box * samples.alpha, samples)
 
 
-def reconstruction(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
-    """Return rec: |C_gt - C|_1."""
-    return (target.weight * (target.colour - pixel_colour(samples.alpha, samples)).abs().sum(1)).mean()
+def colour_errors(samples: RaySamples, target: Target) -> Float[Tensor, " R"]:
+    """Return |C_gt - C|_1 of each ray; its mean over rays is rec."""
+    return target.weight * (target.colour - pixel_colour(samples.alpha, samples)).abs().sum(1)
 
 
 def mask(samples: RaySamples, target: Target) -> Float[Tensor, ""]:

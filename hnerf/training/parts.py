@@ -39,14 +39,15 @@ class Parts:
 
     def backward(
         self, module: nn.Module, scene: PosedScene[Any], rays: PixelRays, draws: Draws, processes: Distributed
-    ) -> dict[str, Tensor]:
+    ) -> tuple[dict[str, Tensor], Tensor]:
         """Add the gradients of this process's share of a joint batch to the parameters' gradients; return the losses by
-        name.
+        name, and the colour errors (R,) of the joint batch.
 
         Losses are means over rays, or do not depend on them: weighted by their numbers of rays, the parts add up to the
         joint batch. `module` averages over processes at the last part.
         """
         n, world_size = self.count, processes.world_size
+        errors = torch.zeros(len(rays), device=rays.colour.device)
 
         def of_part(part: int) -> dict[str, Tensor]:
             mine = processes.rank * n + part, world_size * n
@@ -54,12 +55,15 @@ class Parts:
             weight = world_size * len(part_rays) / len(rays)
             waiting = module if part < n - 1 and isinstance(module, DistributedDataParallel) else None
             with waiting.no_sync() if waiting else nullcontext():
-                terms = module(scene, part_rays, shard(draws, *mine))
+                terms, part_errors = module(scene, part_rays, shard(draws, *mine))
                 (weight * torch.stack(list(terms.values())).sum()).backward()
+            rank, count = mine
+            errors.tensor_split(count)[rank].copy_(part_errors)
             return {name: weight * term.detach() for name, term in terms.items()}
 
         found = list(self.pool.map(of_part, range(n))) if self.pool else [of_part(part) for part in range(n)]
-        return {name: torch.stack([terms[name] for terms in found]).sum() for name in found[0]}
+        joint = {name: torch.stack([terms[name] for terms in found]).sum() for name in found[0]}
+        return joint, processes.all_sum(errors)
 
 
 def decide_parts(

@@ -31,13 +31,14 @@ class Objective(nn.Module):
         self.field, self.correction, self.settings = field, correction, settings
         self.ground_axis = ground_axis
 
-    def forward(self, scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> dict[str, Tensor]:
-        """Return the weighted losses by name; their sum is minimised."""
+    def forward(self, scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> tuple[dict[str, Tensor], Tensor]:
+        """Return the weighted losses by name, whose sum is minimised, and the colour errors of the rays (R,)."""
         target, draws = make_target(rays, draws, self.field.models_background)
         samples, depths_m = self.field.sample(dataclasses.replace(scene, correction=self.correction), rays, draws)
         s = self.settings.losses
+        errors = losses.colour_errors(samples, target)
         terms = {
-            "reconstruction": lambda: losses.reconstruction(samples, target),
+            "reconstruction": lambda: errors.mean(),
             "mask": lambda: losses.mask(samples, target),
             "fog": lambda: losses.fog(samples, target),
             "blend": lambda: losses.blend(samples, target, s.eta),
@@ -52,7 +53,8 @@ class Objective(nn.Module):
         if self.ground_axis is not None:
             d_hat_m = self.field.unit_m * samples.d_hat
             terms["floor"] = lambda: losses.floor(d_hat_m, rays.points(depths_m)[..., self.ground_axis])
-        return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
+        weighted = {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
+        return weighted, errors.detach()
 
 
 def make_target(rays: PixelRays, draws: Draws, models_background: bool) -> tuple[losses.Target, Draws]:

@@ -32,7 +32,7 @@ from hnerf.training.exposure import camera_gains
 from hnerf.training.fixed_rays import FixedRays
 from hnerf.training.gather import gather_pixels
 from hnerf.training.parts import decide_parts
-from hnerf.training.pixels import EDGE_SHARE
+from hnerf.training.pixels import CellErrors
 from hnerf.training.step import Objective, TrainingError, not_finite
 from hnerf.training.tuned_poses import keep_distance, share_rest
 
@@ -82,7 +82,8 @@ class Trainer:
         logger.info("gathering pixels")
         visible_pixels = None if self.field.whole_images else self.field.visible_pixels
         self.pixels = gather_pixels(capture, masks, body, visible_pixels, self.gains, out, processes)
-        self.edge_share = 0.0 if self.field.models_background else EDGE_SHARE  # the paper draws uniformly
+        uniform, cell = self.field.models_background, self.pixels.cell  # the paper draws uniformly
+        self.errors = None if uniform or cell is None else CellErrors(int(cell.max()) + 1)
         seen = self.pixels.starts.diff() > 0  # False where all masks of a frame were dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
@@ -189,13 +190,13 @@ class Trainer:
         rows = self.train_rows if self.step < self.field_steps else self.novel_rows
         pick = torch.randperm(len(rows), generator=self.generator, device=rows.device)[: s.frames_per_step]
         count = s.frames_per_step * s.rays_per_frame // len(pick)
-        rays = self.pixels.draw(rows[pick], count, self.generator, self.edge_share)
+        rays = self.pixels.draw(rows[pick], count, self.generator, self.errors)
         samples = self.field.training_samples(self._progress())
         draws = Draws.random(len(rays), samples, s.noise, self.generator)
         scene = self.scene.with_noise(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
-        terms = self.parts.backward(module, scene, rays, draws, self.processes)
+        terms, errors = self.parts.backward(module, scene, rays, draws, self.processes)
         if self.step >= self.field_steps:  # the loss that pulls all frames to the fit must not move finished frames
             for pose in (self.objective.correction.turn, self.objective.correction.move_m):
                 if pose.grad is not None:
@@ -204,6 +205,8 @@ class Trainer:
         fault = not_finite(terms, gradients, self.step, self.processes)
         if fault is None:
             self.optimizer.step()
+            if self.errors and rays.cell is not None:
+                self.errors.update(rays.cell, errors.cpu())
             self.skipped = 0
         else:
             self.skipped += 1
@@ -220,9 +223,9 @@ class Trainer:
         consume the training's random numbers."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rows, noise = self.train_rows[: self.settings.frames_per_step][:TRIAL_FRAMES], self.settings.noise
-        rays = self.pixels.draw(rows, about // len(rows), generator, self.edge_share)
+        rays = self.pixels.draw(rows, about // len(rows), generator)
         draws = Draws.random(len(rays), self.field.training_samples(1.0), noise, generator)
-        terms = self.objective(self.scene.with_noise(noise, generator), rays, draws)
+        terms, _ = self.objective(self.scene.with_noise(noise, generator), rays, draws)
         return len(rays), torch.stack(list(terms.values())).sum()
 
     def _progress(self) -> float:
@@ -266,6 +269,7 @@ class Trainer:
             "generator": self.generator.get_state(),
             "theta": bodies.theta,
             "root": bodies.root,
+            "errors": None if self.errors is None else self.errors.mean,
             "rig": {name: getattr(bodies.rig, name) for name in ("vertices_m", "joints_m", "beta")},
             "history": json.dumps(self.history),
         }
@@ -280,6 +284,8 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
         self.history = json.loads(state["history"])
+        if self.errors:
+            self.errors.mean = state["errors"].cpu()
         rig = dataclasses.replace(self.body.rig, **state["rig"])
         # from the fit, as in an uninterrupted training, so that it is the same bit by bit
         self.scene.bodies.set_poses(rig, state["theta"], state["root"])

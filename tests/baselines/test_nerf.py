@@ -17,7 +17,7 @@ from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.rays import Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes
-from hnerf.training.losses import Target, blend, reconstruction
+from hnerf.training.losses import Target, blend, colour_errors
 from tests.baselines.ball import RING, body, inner_psnr, psnr, record, trained
 
 SMALL = [
@@ -74,7 +74,7 @@ def test_coarse_and_fine_colours_by_hand(fog: NerfField) -> None:
     assert samples.alpha.shape == depths.shape == (2, 72)
     target = Target(torch.zeros(2, 3), torch.ones(2), torch.ones(2))
     fine, coarse = 0.75 + 0.25 * math.exp(-4), 0.25 + 0.75 * math.exp(-1)
-    assert reconstruction(samples, target).item() == pytest.approx(3 * (fine + 1) / 2, abs=1e-4)
+    assert colour_errors(samples, target).mean().item() == pytest.approx(3 * (fine + 1) / 2, abs=1e-4)
     assert blend(samples, target, 1.0).item() == pytest.approx(3 * (coarse + 1) / 2, abs=1e-4)
     assert depths[0, 0].item() == pytest.approx(1.5)  # the box starts at x = -1.5
 

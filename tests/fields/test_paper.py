@@ -259,7 +259,7 @@ def test_each_loss_of_a_ray_by_hand() -> None:
     correction.absorbed_move_m[1, 1] = 4.0  # one of two frames
     rays = PixelRays(*vars(RAY).values(), torch.ones(1, 3), torch.tensor([True]), torch.tensor([False]), None)
     objective = Objective(field, correction, load_settings("paper").training)
-    terms = objective(field.scene(standing, conditions), rays, DRAWS)
+    terms, errors = objective(field.scene(standing, conditions), rays, DRAWS)
 
     def sigmoid(x: float) -> float:
         return 1 / (1 + math.exp(-x))
@@ -279,6 +279,7 @@ def test_each_loss_of_a_ray_by_hand() -> None:
         "increment": 0.02 * (3 + 4 / 2),
     }
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected, rel=5e-3, abs=1e-12)
+    assert errors.tolist() == pytest.approx([expected["reconstruction"]], rel=5e-3)
 
 
 def test_the_paper_preset_has_the_papers_values() -> None:

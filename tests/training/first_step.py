@@ -1,6 +1,7 @@
 """The first step of a training, with any number of processes."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,9 +26,10 @@ def untrained(folder: Path, kind: str, processes: Distributed, memory_gib: float
 
 
 def gradients(trainer: Trainer, module: torch.nn.Module) -> dict[str, Tensor]:
-    """Return the gradients of one step, by name of the parameter."""
+    """Return the gradients of one step, by name of the parameter, and the errors by cell."""
     trainer._optimise(module)
-    return {name: q.grad.clone() for name, q in trainer.objective.named_parameters() if q.grad is not None}
+    found = {name: q.grad.clone() for name, q in trainer.objective.named_parameters() if q.grad is not None}
+    return found | ({"errors": trainer.errors.mean.clone()} if trainer.errors else {})
 
 
 KINDS = ("fast", "paper")
@@ -43,7 +45,12 @@ def write_first_step(folder: Path, kind: str, parts: int, processes: Distributed
         torch.save(found, folder / "gradients.pt")
     assert trainer.skipped == 0
     forward, odd = trainer.objective.forward, torch.tensor(float("nan") if processes.rank else 0.0)
-    trainer.objective.forward = lambda *batch: forward(*batch) | {"odd": odd}  # type: ignore[method-assign]
+
+    def odd_forward(*batch: Any) -> tuple[dict[str, Tensor], Tensor]:
+        terms, errors = forward(*batch)
+        return terms | {"odd": odd}, errors
+
+    trainer.objective.forward = odd_forward  # type: ignore[method-assign]
     finite = gradients(trainer, module)
     assert all(gradient.isfinite().all() for gradient in finite.values())  # only the loss is not
     (folder / f"skipped{processes.rank}").write_text(str(trainer.skipped))

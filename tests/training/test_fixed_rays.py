@@ -25,14 +25,12 @@ def sample(scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> tuple[RaySa
 def psnr(levels: list[int], person: list[bool], edge: list[bool], models_background: bool) -> float | None:
     """Return the PSNR of a frame with pixels of these grey levels."""
     count = len(levels)
-    at_edge = torch.nonzero(torch.tensor(edge))[:, 0]
     pixels = Pixels(
         starts=torch.tensor([0, count]),
-        edges=at_edge,
-        edge_starts=torch.tensor([0, len(at_edge)]),
         image_starts=torch.tensor([0, count]),
         image_camera=torch.tensor([0]),
         pixel_index=None,
+        cell=None,
         colour=torch.tensor(levels, dtype=torch.uint8)[:, None].expand(count, 3),
         plate=None,
         person=torch.tensor(person),

@@ -19,16 +19,17 @@ CPU = torch.device("cpu")
 
 
 class Scale(nn.Module):
-    """Losses of a parameter w: the mean of w x over rays, and 3 w, which does not depend on rays."""
+    """Losses of a parameter w: the mean of w x over rays, and 3 w, which does not depend on rays; errors x."""
 
     def __init__(self) -> None:
         super().__init__()
         self.w = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
 
-    def forward(self, scene: object, rays: PixelRays, draws: Draws) -> dict[str, Tensor]:
-        """Return `mean` and `increment`."""
+    def forward(self, scene: object, rays: PixelRays, draws: Draws) -> tuple[dict[str, Tensor], Tensor]:
+        """Return `mean` and `increment`, and the errors."""
         assert len(draws.jitter) == len(rays.frame) > 0
-        return {"mean": (self.w * rays.origins_m[:, 0]).mean(), "increment": 3 * self.w}
+        x = rays.origins_m[:, 0]
+        return {"mean": (self.w * x).mean(), "increment": 3 * self.w}, x
 
 
 @pytest.mark.parametrize(
@@ -39,20 +40,23 @@ def test_parts_of_unequal_size_add_up_to_the_whole_batch(
 ) -> None:
     """x is 1 to 7 for seven rays, with a mean of 4: d/dw = 4 + 3. Three parts of 3, 2 and 2 rays have means of 2, 4.5
     and 6.5, whose unweighted mean would be 4.33. Two processes with three parts each have one part of two rays and five
-    of one ray."""
+    of one ray. A process knows the errors of its own rays."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(Distributed, "all_sum", lambda self, values: values)
     x = torch.arange(1.0, 8, dtype=torch.float64)[:, None].expand(7, 3)
     rays = PixelRays(x, x, torch.zeros(7, dtype=torch.long), x, x[:, 0] > 0, x[:, 0] > 0, None)
-    means, slopes = [], []
+    means, slopes, errors = [], [], torch.zeros(7)
     for rank in range(world_size):
         module = Scale()
-        terms = Parts(count, side_by_side, 7).backward(
+        terms, found = Parts(count, side_by_side, 7).backward(
             module, None, rays, Draws.deterministic(7, 1, CPU), Distributed(rank, world_size, CPU)
         )
+        errors += found
         means.append(terms["mean"].item())
         slopes.append(module.w.grad.item())
     assert sum(slopes) / world_size == pytest.approx(7, rel=1e-14)
     assert sum(means) / world_size == pytest.approx(8, rel=1e-14)  # 4 w
+    assert errors.tolist() == [1, 2, 3, 4, 5, 6, 7]
 
 
 def attempted(about: int) -> tuple[int, Tensor]:

@@ -3,42 +3,42 @@
 import dataclasses
 import errno
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from hnerf.capture.masks import encode
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import ReachablePixels, everywhere, within_box, within_reach
 from hnerf.training import gather
 from hnerf.training.gather import gather_pixels
-from hnerf.training.pixels import Pixels
+from hnerf.training.pixels import CellErrors, Pixels
 from hnerf.training.plates import plates_of
-from tests.training.scene import ALONE, FRAMES, SIZE_PX, record
+from tests.training.scene import ALONE, SIZE_PX, record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
 AFAR = dataclasses.replace(AHEAD, K=np.diag([5000.0, 5000.0, 1.0]))  # its rays are almost parallel
 REACHED = functools.partial(within_reach, reach_m=0.2)
 
 
-def test_a_third_of_the_rays_is_drawn_at_edges():
-    """Two frames with four and two pixels. The first frame has an edge at its first pixel, the second has none."""
+def test_each_frame_gets_its_rays_from_its_own_pixels() -> None:
+    """Two frames with four and two pixels."""
     number = torch.arange(6)
-    edge = torch.tensor([True] + [False] * 5)
     pixels = Pixels(
         starts=torch.tensor([0, 4, 6]),
-        edges=torch.tensor([0, 4, 5]),
-        edge_starts=torch.tensor([0, 1, 3]),
         image_starts=torch.tensor([0, 4, 6]),
         image_camera=torch.tensor([0, 0]),
         pixel_index=number.int(),
+        cell=None,
         colour=number[:, None].expand(6, 3).to(torch.uint8),
         plate=None,
-        person=edge,
-        edge=edge,
+        person=number > 3,
+        edge=number > 3,
         widths_px=torch.tensor([3]),
         rays_from_px=torch.eye(3)[None],
         centres_m=torch.zeros(1, 3),
@@ -47,15 +47,56 @@ def test_a_third_of_the_rays_is_drawn_at_edges():
     drawn = (255 * rays.colour[:, 0]).round().long().view(2, 300)
     assert rays.frame.tolist() == [1] * 300 + [0] * 300
     assert drawn[0].unique().tolist() == [4, 5]
-    assert drawn[1, :100].unique().tolist() == [0]
-    assert drawn[1, 100:].unique().tolist() == [0, 1, 2, 3]
-    assert 30 < int((drawn[1, 100:] == 0).sum()) < 70  # about a quarter of the remaining 200 rays
+    assert drawn[1].unique().tolist() == [0, 1, 2, 3]
+    assert 50 < int((drawn[1] == 0).sum()) < 100  # about a quarter
+
+
+def test_a_cell_keeps_half_of_its_earlier_error() -> None:
+    """Cell 0 sees 0.4, then 0.2; cell 1 sees 0.6 and 0.2 in one step; cell 2 sees nothing."""
+    errors = CellErrors(3)
+    errors.update(torch.tensor([0, 1, 1], dtype=torch.int32), torch.tensor([0.4, 0.6, 0.2]))
+    assert errors.mean.tolist() == pytest.approx([0.2, 0.8 / 3, 0])
+    errors.update(torch.tensor([0], dtype=torch.int32), torch.tensor([0.2]))
+    assert errors.mean.tolist() == pytest.approx([0.2, 0.8 / 3, 0])
+
+
+def test_of_four_candidates_the_one_in_the_cell_with_the_largest_error_is_drawn(tmp_path: Path) -> None:
+    """A share of a frame's pixels is in cells with an error of 0.2, the rest in cells with 0.1. A cell that no ray has
+    met precedes both, but not one whose error was zero."""
+    pixels = gather_pixels(*record(tmp_path), REACHED, {}, tmp_path, ALONE)
+    errors, generator = CellErrors(int(pixels.cell.max()) + 1), torch.Generator().manual_seed(0)
+    of_frame = pixels.cell[: pixels.starts[1]]
+    last = of_frame[-1]
+
+    def drawn(chosen: Callable[[Tensor], Tensor]) -> tuple[float, float]:
+        """Return the share of draws in the chosen cells, and the share expected if they precede all others."""
+        cell = pixels.draw(torch.tensor([0]), 4000, generator, errors).cell
+        return float(chosen(cell).double().mean()), 1 - (1 - float(chosen(of_frame).double().mean())) ** 4
+
+    errors.mean[:] = torch.where(torch.arange(len(errors.mean)) % 3 == 0, 0.2, 0.1)
+    found, expected = drawn(lambda cell: cell % 3 == 0)
+    assert found == pytest.approx(expected, abs=0.03)
+    errors.mean[last] = 0
+    found, expected = drawn(lambda cell: cell == last)
+    assert found == pytest.approx(expected, abs=0.01) and expected > 0.02
+    errors.update(last[None], torch.zeros(1))
+    assert drawn(lambda cell: cell == last)[0] == 0
+
+
+def test_cells_are_squares_of_four_pixels_of_an_image(tmp_path: Path) -> None:
+    """Numbers are consecutive over images, and only for squares with pixels."""
+    pixels = gather_pixels(*record(tmp_path), REACHED, {}, tmp_path, ALONE)
+    _, xy_px = pixels.cameras_and_xy(torch.arange(len(pixels.person)))
+    image = torch.arange(len(pixels.image_camera)).repeat_interleave(pixels.image_starts.diff())
+    wanted = torch.stack([image, xy_px[:, 1] // 4, xy_px[:, 0] // 4], 1)
+    _, expected = torch.unique(wanted, dim=0, return_inverse=True)
+    assert torch.equal(pixels.cell.long(), expected)
 
 
 def test_camera_and_position_of_a_pixel_follow_from_its_index() -> None:
     """Images of 3 x 2, 2 x 2 and 3 x 2 pixels from cameras 0, 1 and 0; first with all pixels, then with some."""
     none = torch.zeros(0)
-    names = ("starts", "edges", "edge_starts", "colour", "plate", "person", "edge", "rays_from_px", "centres_m")
+    names = ("starts", "cell", "colour", "plate", "person", "edge", "rays_from_px", "centres_m")
     like = dict.fromkeys(names, none)
     images = {"image_camera": torch.tensor([0, 1, 0]), "widths_px": torch.tensor([3, 2])}
     whole = Pixels(image_starts=torch.tensor([0, 6, 10, 16]), pixel_index=None, **images, **like)
@@ -137,7 +178,6 @@ def test_outline_pixels_with_an_unknown_background_are_left_out(
     some = gather_pixels(capture, masks, body, REACHED, {}, tmp_path, ALONE)
     left_out = every.edge & (every.cameras_and_xy(torch.arange(len(every.edge)))[0] == 1)
     assert left_out.any() and torch.equal(some.colour, every.colour[~left_out])
-    assert torch.equal(some.edges, torch.nonzero(some.edge)[:, 0])
 
 
 def test_edges_extend_two_pixels_inwards_and_outwards(tmp_path: Path):
@@ -149,24 +189,6 @@ def test_edges_extend_two_pixels_inwards_and_outwards(tmp_path: Path):
     pixels = gather_pixels(capture, masks, body, None, {}, tmp_path, ALONE)
     edge = pixels.edge[: SIZE_PX**2].view(SIZE_PX, SIZE_PX)
     assert edge.sum() == 16**2 - 8**2 and edge[8:24, 8:24].sum() == edge.sum() and not edge[12:20, 12:20].any()
-
-
-def test_edges_are_found_in_every_frame(tmp_path: Path):
-    pixels = gather_pixels(*record(tmp_path), REACHED, {}, tmp_path, ALONE)
-    assert torch.equal(pixels.edges, torch.nonzero(pixels.edge)[:, 0])
-    for row in range(len(FRAMES)):
-        part = pixels.edges[pixels.edge_starts[row] : pixels.edge_starts[row + 1]]
-        assert len(part)
-        assert ((part >= pixels.starts[row]) & (part < pixels.starts[row + 1])).all()
-
-
-def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
-    """The person fills every image of the first frame."""
-    capture, masks, body = record(tmp_path)
-    for camera in capture.train_cameras:
-        masks.encoded[camera, 0] = encode(np.ones((SIZE_PX, SIZE_PX), bool))
-    pixels = gather_pixels(capture, masks, body, REACHED, {}, tmp_path, ALONE)
-    assert torch.equal(pixels.edges[: pixels.edge_starts[1]], torch.arange(int(pixels.starts[1])))
 
 
 def test_a_body_inside_the_image_reaches_a_disc_around_each_vertex():

@@ -68,7 +68,8 @@ def objective_terms(
     correction.absorbed_shape.copy_(torch.tensor([3.0, 4.0]))
     origins_m, down = torch.tensor([[0.0, 0.0, 1.0]] * 2), torch.tensor([[0.0, 0.0, -1.0]] * 2)
     rays = PixelRays(origins_m, down, down[:, 0], TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
-    return Objective(field, correction, settings, axis)(PosedScene(None, None, None), rays, Draws(down, down, down))
+    objective = Objective(field, correction, settings, axis)
+    return objective(PosedScene(None, None, None), rays, Draws(down, down, down))[0]
 
 
 def test_each_loss_gets_its_own_inputs_and_weight() -> None:

@@ -26,9 +26,10 @@ class RecordingObjective(torch.nn.Module):
         super().__init__()
         self.trainer, self.parts = trainer, []
 
-    def forward(self, scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> dict[str, Tensor]:
+    def forward(self, scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> tuple[dict[str, Tensor], Tensor]:
         self.parts.append((rays, scene.conditions, draws))
-        return {"nothing": sum(p.sum() for p in self.trainer.objective.parameters() if p.requires_grad) * 0.0}
+        nothing = sum(p.sum() for p in self.trainer.objective.parameters() if p.requires_grad) * 0.0
+        return {"nothing": nothing}, torch.zeros(len(rays))
 
     def all(self, part: int, name: str) -> Tensor:
         """Return the tensor of this name from the rays (0) or draws (2) of all parts."""
