@@ -7,7 +7,7 @@ from hnerf.config import Settings
 from hnerf.study.benchmark.plan import CapturePart
 from tasks.calibration import calibrate
 from tasks.capture import ingest, subset_capture
-from tasks.detection import detect, detect_by_model, find_hands, needs_detection, needs_hands
+from tasks.detection import detect, find_hands, needs_detection, needs_hands
 from tasks.fit import fit
 from tasks.limits import set_limits
 from tasks.segmentation import converged, needs_body, segment
@@ -27,11 +27,9 @@ class Prepared(NamedTuple):
 def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
     """Return the recording with people detected by a network, if it needs that, and with keypoints of the subject's
     hands, if they are wanted and the network is installed."""
-    recording, network = recorded, settings.detection
-    if needs_detection(recorded, network) and network.model is not None:
-        recording = detect_by_model(store, recorded, network)
-    elif needs_detection(recorded, network):
-        recording = detect(store, recorded, network.source, network.size)
+    recording = recorded
+    if needs_detection(recorded, settings.detection):
+        recording = detect(store, recorded, settings.detection)
     return find_hands(store, recording) if needs_hands(recording, settings.detection) else recording
 
 

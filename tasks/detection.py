@@ -14,19 +14,9 @@ from tasks.store import Artifact
 
 
 @stage("detection", version="6", resumable=True)
-def detect(out: Path, recording: Artifact, source: str | None, size: str) -> dict[str, float]:
+def detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[str, float]:
     """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
-    finished. source, size: of DetectionSettings without `model`; `hands` does not change the result."""
-    return _detect(out, recording, DetectionSettings.model_validate({"source": source, "size": size}))
-
-
-@stage("detection", version="6", resumable=True)
-def detect_by_model(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[str, float]:
-    """Do the same with a keypoint network of the user's own, `settings.model`, on whose bytes the key depends."""
-    return _detect(out, recording, settings)
-
-
-def _detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[str, float]:
+    finished."""
     try:
         report = detect_people(Capture.load(recording.root), settings, out)
     except BrokenProcessPool as error:

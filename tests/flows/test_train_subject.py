@@ -50,7 +50,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         Capture("ada", out, {"1": camera}, ("1",), (), (0,), (), 25.0, "z", {"1": (4, 4)}, {"1": (4, 4)}).save()
         return {}
 
-    replace_stages(monkeypatch, (*STAGES, "detect_by_model"), write)
+    replace_stages(monkeypatch, STAGES, write)
     monkeypatch.setattr(preparation, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
     monkeypatch.setattr(preparation, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
     monkeypatch.setattr(preparation, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
