@@ -136,7 +136,7 @@ def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int,
     if not (theta[:, fingers] != 0).any():
         theta[:, fingers] = prior.relaxed()
     views = moved_onto_palm(views, articulation.jacobian(points, articulation.pose(pose))[0])
-    shown = (views.confidence[..., [0, 21]] > SEEN).any(0)
+    shown = (views.confidence.unflatten(-1, (2, -1)).amax(-1) > SEEN).any(0)
     for number, outlier_m in enumerate(STEPS_M):
         x, by_frame, _ = articulation.jacobian(points, articulation.pose(replace(pose, theta=theta)))
         matrix, pull, _ = reprojection_term(views, scale_m, x, POINT_STD_M, outlier_m)

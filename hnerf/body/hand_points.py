@@ -19,7 +19,7 @@ PALM_ROWS = [*PALM, *(21 + k for k in PALM)]  # of both hands
 # For a point seen with full confidence: the network is 2.5 px off, in either direction, if a hand is 30 px long.
 POINT_STD_M, OUTLIER_M = 0.012, 0.06
 PALM_STD_M = POINT_STD_M * len(PALM) ** 0.5  # the points of a palm are off together, so they count as one
-SEEN = 0.5  # least confidence at which a view counts
+SEEN = 0.5  # confidence of a hand's surest point above which a view shows the hand
 EPSILON = 1e-9
 
 
@@ -67,13 +67,13 @@ def observe_hands(capture: Capture) -> Views | None:
         return None
     hands = torch.from_numpy(np.stack([h for h in found if h is not None]).astype(np.float64))  # (C, n, 2, 21, 3)
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
-    confidence = hands[..., 2] * seen_twice(hands[..., 0, 2])[..., None]
+    confidence = hands[..., 2] * seen_twice(hands[..., 2].amax(-1))[..., None]
     return Views(cameras, hands[..., :2].flatten(2, 3), confidence.flatten(2, 3))
 
 
 def seen_twice(confidence: Tensor) -> Tensor:
-    """Return which hands (n, 2) at least two cameras see, from the confidences of their wrists (C, n, 2). A single view
-    hardly distinguishes a palm that leans towards the camera from one that leans away."""
+    """Return which hands (n, 2) at least two cameras see, from the confidences of their surest points (C, n, 2). A
+    single view hardly distinguishes a palm that leans towards the camera from one that leans away."""
     return (confidence > SEEN).sum(0) > 1
 
 

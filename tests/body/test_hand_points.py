@@ -70,15 +70,16 @@ def test_a_hand_must_be_seen_by_two_cameras() -> None:
 
 
 def test_observations_of_hands_seen_by_one_camera_are_dropped() -> None:
-    """Both cameras see the left hand; only the first one sees the right hand with confidence."""
-    found = {"0": np.full((1, 2, 21, 3), 0.9), "1": np.full((1, 2, 21, 3), 0.6)}
-    found["1"][0, 1, :, 2] = 0.4
+    """Both cameras see the left hand, the second one with a single sure point; only the first one sees the right hand
+    with confidence."""
+    found = {"0": np.full((1, 2, 21, 3), 0.9), "1": np.full((1, 2, 21, 3), 0.4)}
+    found["1"][0, 0, 20, 2] = 0.6
     capture: Any = SimpleNamespace(
         train_cameras=("0", "1"), cameras=dict(zip("01", CAMERAS, strict=True)), hands=found.get
     )
     views = observe_hands(capture)
     assert views is not None and views.cameras == CAMERAS
-    assert views.confidence[:, 0, [0, 20, 21, 41]].tolist() == [[0.9, 0.9, 0, 0], [0.6, 0.6, 0, 0]]
+    assert views.confidence[:, 0, [0, 20, 21, 41]].tolist() == [[0.9, 0.9, 0, 0], [0.4, 0.6, 0, 0]]
     for names in (("0",), ("0", "2")):  # a single camera, and one without hand detection
         capture.train_cameras = names
         assert observe_hands(capture) is None
