@@ -69,7 +69,7 @@ class DetectionSettings(Section):
     source: Literal["recording", "network", "both"] | None = None  # null: see docs/formats.md, From a network
     size: Literal["heavy", "full", "lite"] = "heavy"  # of the landmark network
     model: Path | None = None  # ONNX keypoint network; its keypoints replace those of the landmark network
-    hands: Literal["auto", "none"] = "auto"  # auto: find the hands if the networks are installed; 0.04 s per image
+    hands: Literal["auto", "none"] = "auto"  # auto: use the capture's hands, else find them if the network is installed
 
 
 class CalibrationSettings(Section):

@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("capture", version="21")
+@stage("capture", version="22")
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
     """Read a recording in any supported layout; undistort and normalise it."""
     try:

@@ -34,16 +34,15 @@ def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
     return settings.source in ("network", "both") or (settings.source is None and (silent or flat))
 
 
-@stage("hands", version="2")
+@stage("hands", version="3", networks=(HAND_LANDMARKS,))
 def find_hands(out: Path, recording: Artifact) -> dict[str, float]:
-    """Write the recording with keypoints of hands. Return the lowest share of hands found in any camera."""
+    """Write the recording with points of the subject's hands. Return the lowest share of hands found in any camera."""
     return {"least_found": min(detect_hands(Capture.load(recording.root), out).values())}
 
 
 def needs_hands(recording: Artifact, settings: DetectionSettings) -> bool:
-    """Return whether to detect hands: the settings allow it, the network is installed, there are keypoints that locate
-    the hands, and there are several cameras, which a fit of fingers needs."""
-    if settings.hands != "auto" or not has_model(HAND_LANDMARKS):
-        return False
+    """Return whether to look for hands: the settings allow it, the recording has hands or the network is installed,
+    there are keypoints that locate the hands, and there are several cameras, which a fit of fingers needs."""
     capture = Capture.load(recording.root)
-    return capture.has_keypoints and len(capture.train_cameras) > 1
+    found = settings.hands == "auto" and (capture.has_given_hands or has_model(HAND_LANDMARKS))
+    return found and capture.has_keypoints and len(capture.train_cameras) > 1

@@ -2,7 +2,8 @@
 
 A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted) and, if the
 recording has them, `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz` and
-`poses.npz`; if a network detected people, `person/<camera>/<frame:06d>.png`; if one detected hands, `hands.npz`.
+`poses.npz`, and `given_hands.npz`; if a network detected people, `person/<camera>/<frame:06d>.png`; once hands were
+looked for, `hands.npz`.
 """
 
 import dataclasses
@@ -26,7 +27,8 @@ from hnerf.geometry.camera import Camera
 PERSON = "person"  # folder: <camera>/<frame>.png, 255 times the probability
 KEYPOINTS = "keypoints.npz"  # by camera
 LANDMARKS = "landmarks"  # folder: <camera>.npz, of people
-HANDS = "hands.npz"  # by camera: points of the subject's hands, found by a network
+GIVEN_HANDS = "given_hands.npz"  # by camera: points of the hands of all people, as recorded
+HANDS = "hands.npz"  # by camera: points of the subject's hands, as recorded or found by a network
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
@@ -125,9 +127,18 @@ class Capture:
         return self._points(KEYPOINTS, camera)
 
     def hands(self, camera: str) -> np.ndarray | None:
-        """Return the subject's left and right hand (frames, 2, 21, 3) in the order of `keypoints`; None if no network
-        was run to find hands."""
+        """Return the subject's left and right hand (frames, 2, 21, 3) in the order of `keypoints`; None if hands were
+        not looked for."""
         return self._points(HANDS, camera)
+
+    def given_hands(self, camera: str) -> np.ndarray | None:
+        """Return the left and right hands (frames, people, 2, 21, 3) of the people in `keypoints`, as the recording's
+        own files have them; None if they have none. Only of a capture whose cameras are not synchronised yet."""
+        path = self.root / GIVEN_HANDS
+        if not path.exists():
+            return None
+        with np.load(path, allow_pickle=False) as stored:
+            return stored.get(camera)
 
     def landmarks(self, camera: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Return a network's landmarks of people (frames, people, 33, 3) in the order of `frames`, each from the
@@ -157,6 +168,11 @@ class Capture:
     def has_keypoints(self) -> bool:
         """Return whether any keypoints were detected in this recording."""
         return (self.root / KEYPOINTS).exists()
+
+    @property
+    def has_given_hands(self) -> bool:
+        """Return whether the recording's own files have points of anybody's hands."""
+        return (self.root / GIVEN_HANDS).exists()
 
     @property
     def has_person_masks(self) -> bool:

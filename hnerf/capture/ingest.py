@@ -10,7 +10,7 @@ import numpy as np
 
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
-from hnerf.capture.capture import KEYPOINTS, Capture, SubjectPoint
+from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, Capture, SubjectPoint
 from hnerf.capture.clocks import InStep, in_step, read_clocks, warn_if_uneven
 from hnerf.capture.footage import Footage, Video, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
@@ -21,8 +21,8 @@ from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.videos import Videos
 from hnerf.capture.formats.zjumocap import ZjuMocap
-from hnerf.capture.keypoint_files import pad_people, read_results
-from hnerf.capture.keypoint_sets import to_body_25
+from hnerf.capture.keypoint_files import pad_hands, pad_people, read_results
+from hnerf.capture.keypoint_sets import hands_of, to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import (
     NO_FRAME,
@@ -113,8 +113,10 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     written = {name: _write_camera(layout, lenses[name], one, wanted, settings, out) for name, one in footage.items()}
     normalisers = {name: normaliser for name, (normaliser, _) in written.items()}
     rows = np.searchsorted(recorded, wanted)
-    chosen = to_body_25({name: found[rows] for name, found in people.items()}, manifest.keypoints)
-    write_points(out / KEYPOINTS, {name: normalisers[name].keypoints(points) for name, points in chosen.items()})
+    people = {name: found[rows] for name, found in people.items()}
+    hands = {name: points for name, found in people.items() if (points := hands_of(found)) is not None}
+    for file, chosen in ((KEYPOINTS, to_body_25(people, manifest.keypoints)), (GIVEN_HANDS, hands)):
+        write_points(out / file, {name: normalisers[name].keypoints(points) for name, points in chosen.items()})
     _write_given_poses(folder, layout, wanted, out)
     if not uncalibrated and (boards := read_board_footage(folder, "extrinsic")):
         normalised_corners(boards, normalisers).save(out)
@@ -385,7 +387,7 @@ def _per_frame(
 
 
 def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
-    """Return detected keypoints (frames, most people, K, 3), zero for absent people; None if there are none.
+    """Return detected keypoints (frames, most people, K, 3), zero for absent people and hands; None if there are none.
 
     They come from the layout's own files, else from a list of results in keypoints/<camera>.json. Raises InputError if
     they are not in pixels of the images.
@@ -400,6 +402,7 @@ def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | No
         paths, people, place = [results] * len(recorded), read_results(results, recorded), results
     else:
         return None
+    people = pad_hands(people)
     count = next((p.shape[1] for p in people if len(p)), 0)
     for path, points in zip(paths, people, strict=True):
         if len(points) and points.shape[1] != count:

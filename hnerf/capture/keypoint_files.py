@@ -8,22 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from hnerf.capture.keypoint_sets import COUNTS, KNOWN
+from hnerf.capture.keypoint_sets import COUNTS, HAND_POINTS, KNOWN
 from hnerf.capture.safe_io import MAX_TEXT_BYTES, read_json
 from hnerf.errors import InputError
 
 MAX_PEOPLE = 64  # in one image
 FRAME_BYTES = 32_000  # in a list of results: four people of 136 points with all digits
+OPENPOSE_HANDS = ("hand_left_keypoints_2d", "hand_right_keypoints_2d")
 MAX_PX = 1e6  # of a coordinate; far larger ones overflow in later arithmetic
 
 
 def read_openpose(path: Path) -> np.ndarray:
     """Read an OpenPose file: (people, K, 3) x_px, y_px, confidence in the file's order. K is a known number of points,
-    or 0 without people; people without points are ignored. Raises InputError if it is no such file."""
+    HAND_POINTS more if the file has hands, or 0 without people; people without points are ignored. Raises InputError if
+    it is no such file."""
     try:
         people = _check_count(path, read_json(path)["people"])
-        found = [person["pose_keypoints_2d"] for person in people if person != {}]
-        return _people(path, [points for points in found if points != []])
+        found = [person for person in people if person != {} and person["pose_keypoints_2d"] != []]
+        hands = [[person.get(side, []) for side in OPENPOSE_HANDS] for person in found]
+        return _with_hands(path, _people(path, [person["pose_keypoints_2d"] for person in found]), hands)
     except (KeyError, TypeError):
         raise InputError(f"{path}: no list of people with pose_keypoints_2d; detect them again") from None
 
@@ -84,12 +87,38 @@ def _people(path: Path, triples: list[Any]) -> np.ndarray:
     """Convert flat x, y, confidence lists of one image to an array. Raises InputError if they are not keypoints."""
     if not triples:
         return np.zeros((0, 0, 3))
+    points = _points(path, triples)
+    if points.shape[1] not in COUNTS:
+        raise InputError(f"{path}: {points.shape[1]} keypoints a person; known sets are {KNOWN}")
+    return points
+
+
+def _with_hands(path: Path, people: np.ndarray, hands: list[list[Any]]) -> np.ndarray:
+    """Return people (P, K, 3) with the points of their left and right hands, flat lists that are empty for an absent
+    hand, appended; without them if no list has any. Raises InputError if they are not 21 points each."""
+    if not any(side != [] for sides in hands for side in sides):
+        return people
+    absent = [0.0] * (3 * HAND_POINTS // 2)
+    points = _points(path, [[absent if side == [] else side for side in sides] for sides in hands])
+    if points.shape[1] != HAND_POINTS:
+        raise InputError(f"{path}: a hand has {HAND_POINTS // 2} points; detect again, or without hands")
+    return np.concatenate([people, points], 1)
+
+
+def pad_hands(people: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the people of each image, (P, K, 3), with absent hands where only other images have hands."""
+    most = max((found.shape[1] for found in people if len(found)), default=0)
+    absent = ((0, 0), (0, HAND_POINTS), (0, 0))
+    return [np.pad(p, absent) if len(p) and p.shape[1] == most - HAND_POINTS else p for p in people]
+
+
+def _points(path: Path, triples: list[Any]) -> np.ndarray:
+    """Convert lists of x, y, confidence, one for each person, to an array (P, K, 3). Raises InputError if they are not
+    points."""
     try:
         points = np.array(triples, dtype=np.float64).reshape(len(triples), -1, 3)
     except (OverflowError, TypeError, ValueError):
         raise InputError(f"{path}: keypoints are not triples of numbers, as many per person; detect again") from None
-    if points.shape[1] not in COUNTS:
-        raise InputError(f"{path}: {points.shape[1]} keypoints a person; known sets are {KNOWN}")
     if not np.isfinite(points).all():
         raise InputError(f"{path}: a keypoint is NaN or infinite; detect them again")
     points[..., 2] = points[..., 2].clip(0, 1)  # some detectors exceed 1, and COCO's own annotations reach 2

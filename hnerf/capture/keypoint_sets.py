@@ -11,6 +11,9 @@ import numpy as np
 
 from hnerf.errors import InputError
 
+# Points of the left hand, then of the right: the wrist, then four of each finger, from the thumb on. Every array of
+# more points ends with them: the two whole-body sets, and others to whose points a file adds hands.
+HAND_POINTS = 42
 LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13), (13, 14),
          (1, 8), (0, 1))  # fmt: skip
 FEET = ((11, 24), (11, 22), (14, 21), (14, 19))
@@ -51,7 +54,7 @@ SETS: dict[KeypointSetName, KeypointSet] = {
     # OpenPose, src/openpose/pose/poseParameters.cpp: 17 upper neck, 18 head top, then the feet.
     "body_25b": KeypointSet(25, (*_COCO, *((k,) for k in range(19, 25)))),
     "halpe_26": KeypointSet(26, _HALPE),
-    "coco_wholebody": KeypointSet(133, (*_COCO, *((k,) for k in range(17, 23)))),  # Jin et al. 2020; face, hands unused
+    "coco_wholebody": KeypointSet(133, (*_COCO, *((k,) for k in range(17, 23)))),  # Jin et al. 2020; face unused
     "halpe_136": KeypointSet(136, _HALPE),  # Halpe-26, then face and hands
     "blazepose_33": KeypointSet(33, _BLAZEPOSE),
 }
@@ -64,9 +67,10 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
     25, 3).
 
     `named` is the set of all cameras. Without it, the number of points identifies the set; for 25, which two sets have,
-    so does which points form the face. K is 0 if nobody was detected. Raises InputError if `named` has another number
-    of points.
+    so does which points form the face. K is 0 if nobody was detected. Hands do not count. Raises InputError if `named`
+    has another number of points.
     """
+    detections = {camera: _without_added_hands(points) for camera, points in detections.items()}
     of_25 = [points.reshape(-1, 25, 3) for points in detections.values() if points.shape[-2] == 25]
     set_of_25: KeypointSetName = "body_25" if not of_25 or is_body_25(np.concatenate(of_25)) else "body_25b"
     by_count = {known.points: known for known in SETS.values()} | {25: SETS[set_of_25]}
@@ -84,6 +88,18 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
             )
         found[camera] = _combined(points, chosen)
     return found
+
+
+def hands_of(detections: np.ndarray) -> np.ndarray | None:
+    """Return the left and the right hand (..., 2, 21, 3) of detections (..., K, 3); None if none is seen."""
+    if detections.shape[-2] <= HAND_POINTS or not (detections[..., -HAND_POINTS:, 2] > 0).any():
+        return None
+    return detections[..., -HAND_POINTS:, :].reshape(*detections.shape[:-2], 2, HAND_POINTS // 2, 3)
+
+
+def _without_added_hands(points: np.ndarray) -> np.ndarray:
+    """Return the points of one of SETS: points (..., K, 3) without hands, if these are not in the set itself."""
+    return points[..., :-HAND_POINTS, :] if points.shape[-2] - HAND_POINTS in COUNTS else points
 
 
 def _combined(points: np.ndarray, known: KeypointSet) -> np.ndarray:

@@ -16,7 +16,7 @@ from zipfile import BadZipFile, ZipFile
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import KEYPOINTS, LANDMARKS, PERSON, Capture, to_8_bit, write_image
+from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, LANDMARKS, PERSON, Capture, to_8_bit, write_image
 from hnerf.capture.keypoint_files import pad_people
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.subject import ranked_people
@@ -65,6 +65,8 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     for name, points in people.items():  # keypoints that the network guesses outside the image count as not seen
         points *= capture.cameras[name].holds(points[..., :2])[..., None]
     copy_folder(capture.root, out)
+    if alone:  # the people of the recording's own files are left out
+        (out / GIVEN_HANDS).unlink(missing_ok=True)
     write_points(out / KEYPOINTS, people if alone else _with_own(capture, people))
     detected = Capture.load(out)
     ranked = ranked_people(detected)

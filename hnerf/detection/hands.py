@@ -1,6 +1,7 @@
-"""Hands: 21 points of each of the subject's hands, found by MediaPipe's hand network (Zhang et al. 2020) where the
-forearm ends."""
+"""Hands: 21 points of each of the subject's hands, from the recording's own files, or found by MediaPipe's hand network
+(Zhang et al. 2020) where the forearm ends."""
 
+import logging
 import math
 import threading
 from pathlib import Path
@@ -12,10 +13,11 @@ from hnerf.capture.capture import HANDS, Capture
 from hnerf.capture.people import person_heights_px
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import write_points
+from hnerf.detection.merge import nearest_person
 from hnerf.detection.network import Network
 from hnerf.detection.region import Region, upright_angle
 from hnerf.files import copy_folder
-from hnerf.models import HAND_LANDMARKS
+from hnerf.models import HAND_LANDMARKS, has_model
 from hnerf.progress import tracked
 from hnerf.side_by_side import side_by_side
 
@@ -29,29 +31,66 @@ KNUCKLES = ([9], [5, 13])  # the hand's direction: half from the middle finger's
 AHEAD, AROUND = 0.1, 2.0  # of the next region: shift towards the finger tips, and side, in sizes of the palm
 FAR = 0.5  # of the region's side: a hand whose wrist is farther from the body's wrist is another hand
 SAME = 0.25  # of the region's side: median point distance below which two hands are the same one
-FOUND = 0.5  # confidence above which a hand counts as found, in the report
+FOUND = 0.5  # confidence of its surest point above which a hand counts as found, in the report
+
+log = logging.getLogger("hnerf.hands")
 
 
 def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
     """Write the capture into `out` with the subject's hands in its training cameras; return the share of hands found by
     camera.
 
-    Test cameras are never read. Raises InputError if the network is missing or there is no subject.
+    The network, if it is installed, searches the cameras whose own files do not have the subject's hands in most frames
+    that show the subject. Test cameras are never read. Raises InputError if the network is altered or there is no
+    subject.
     """
+    people = subject_keypoints(capture)
+    hands = {name: given_hands(capture, name, keypoints) for name, keypoints in people.items()}
+    own = [name for name, keypoints in people.items() if _in_most_frames(hands[name], keypoints)]
+    if own:
+        log.info("hands: from the recording's own files in %s", ", ".join(own))
+    if len(own) < len(people) and has_model(HAND_LANDMARKS):
+        hands |= _search(capture, {name: people[name] for name in people if name not in own})
+    copy_folder(capture.root, out)
+    write_points(out / HANDS, hands)
+    return {name: float((points[..., 2].max(-1) > FOUND).mean()) for name, points in hands.items()}
+
+
+def given_hands(capture: Capture, camera: str, subject: np.ndarray) -> np.ndarray:
+    """Return the hands (frames, 2, 21, 3) that the recording's own files have of the subject, keypoints (frames, 25,
+    3); 0 where they have none."""
+    hands = np.zeros((len(subject), 2, POINTS, 3))
+    given, people = capture.given_hands(camera), capture.keypoints(camera)
+    if given is None or people is None:
+        return hands
+    for i, keypoints in enumerate(subject):
+        person = nearest_person(keypoints, people[i])
+        if person is not None and person < given.shape[1]:  # others were added by a network
+            hands[i] = given[i, person]
+    return hands
+
+
+def _in_most_frames(hands: np.ndarray, subject: np.ndarray) -> bool:
+    """Return whether most of the frames that show the subject (frames, 25, 3) have a point of a hand, (frames, 2, 21,
+    3)."""
+    shown, seen = (hands[..., 2] > 0).any((1, 2)), (subject[..., 2] > 0).any(1)
+    return bool(2 * shown.sum() > seen.sum())
+
+
+def _search(capture: Capture, people: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the hands (frames, 2, 21, 3) that the network finds in each of these cameras, given the subject's
+    keypoints in them."""
     cv2.setNumThreads(1)
-    network, people = HandNetwork(), subject_keypoints(capture)
-    images = [(name, number) for name in capture.train_cameras for number in range(len(capture.frames))]
+    network = HandNetwork()
+    images = [(name, number) for name in people for number in range(len(capture.frames))]
 
     def find(image: tuple[str, int]) -> np.ndarray:
         name, number = image
         return find_hands(capture.image(name, capture.frames[number]), people[name][number], network)
 
     found = list(tracked(side_by_side(find, images), "hands", len(images)))
-    stacked = np.stack(found).reshape(len(capture.train_cameras), len(capture.frames), 2, POINTS, 3)
-    by_camera = dict(zip(capture.train_cameras, stacked, strict=True))
-    copy_folder(capture.root, out)
-    write_points(out / HANDS, by_camera)
-    return {name: float((hands[..., 0, 2] > FOUND).mean()) for name, hands in by_camera.items()}
+    stacked = np.stack(found).reshape(len(people), len(capture.frames), 2, POINTS, 3)
+    return dict(zip(people, stacked, strict=True))
 
 
 class HandNetwork(threading.local):

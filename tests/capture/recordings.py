@@ -26,9 +26,13 @@ def picture(camera: str, frame: int) -> np.ndarray:
     return np.random.default_rng([int(camera[-2:]), frame]).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
-def write_keypoints(path: Path, people: list) -> None:
+def write_keypoints(path: Path, people: list, hands: list | None = None) -> None:
+    """Write an OpenPose file of people (K, 3). hands: of each of them, left and right, (21, 3) or an empty list."""
     path.parent.mkdir(parents=True, exist_ok=True)
     triples = [{"pose_keypoints_2d": np.ravel(points).tolist()} for points in people]
+    for person, sides in zip(triples, hands or [], strict=False):
+        for side, points in zip(("left", "right"), sides, strict=True):
+            person[f"hand_{side}_keypoints_2d"] = np.ravel(points).tolist()
     path.write_text(json.dumps({"people": triples}))
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hnerf.capture.ingest import ingest
-from hnerf.capture.keypoint_files import pad_people, read_openpose, read_results
-from hnerf.capture.keypoint_sets import SETS, KeypointSetName, is_body_25, to_body_25
+from hnerf.capture.keypoint_files import pad_hands, pad_people, read_openpose, read_results
+from hnerf.capture.keypoint_sets import SETS, KeypointSetName, hands_of, is_body_25, to_body_25
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture import recordings as rec
@@ -55,6 +55,25 @@ def test_openpose_coco_and_body_25_are_converted() -> None:
 def test_the_number_of_points_identifies_the_set(count: int) -> None:
     (name,) = (name for name, known in SETS.items() if known.points == count)
     assert np.array_equal(converted(count), converted(count, name))
+
+
+@pytest.mark.parametrize(("count", "left", "right"), [(133, 91, 112), (136, 94, 115)])
+def test_whole_body_sets_have_hands(count: int, left: int, right: int) -> None:
+    """COCO-WholeBody's last points are the left hand, 91 to 111, and the right; Halpe's, 94 to 114, and the right."""
+    hands = hands_of(points(count)[None, None])
+    assert hands is not None and hands.shape == (1, 1, 2, 21, 3)
+    assert hands[0, 0, :, [0, 20], 0].tolist() == [[left, right], [left + 20, right + 20]]
+    unseen = points(count)
+    unseen[left:, 2] = 0
+    assert hands_of(unseen[None, None]) is None and hands_of(points(26)[None, None]) is None
+
+
+@pytest.mark.parametrize("count", [17, 18, 25, 26, 133])
+def test_hands_that_a_file_adds_do_not_change_the_body(count: int) -> None:
+    with_hands = np.concatenate([points(count), 7 + points(42)])
+    assert np.array_equal(to_body_25({"01": with_hands[None, None]}, None)["01"][0, 0], converted(count))
+    hands = hands_of(with_hands[None, None])
+    assert hands is not None and hands[0, 0, :, 0, 0].tolist() == [7, 28]
 
 
 def person(face: slice, others: slice) -> np.ndarray:
@@ -112,6 +131,57 @@ def test_people_without_points_are_left_out(tmp_path: Path) -> None:
     for count, kept in ((3, (1, 25, 3)), (2, (0, 0, 3))):
         (tmp_path / "a.json").write_text(json.dumps({"people": people[:count]}))
         assert read_openpose(tmp_path / "a.json").shape == kept
+
+
+def test_hands_are_read_after_their_persons_points(tmp_path: Path) -> None:
+    """OpenPose writes empty lists if it did not look for hands; here, the first person has a left hand alone."""
+    path, left = tmp_path / "a.json", points(21) / [1, 100, 1]
+    rec.write_keypoints(path, [points(25), points(25)], [(left, []), ([], [])])
+    found = read_openpose(path)
+    assert found.shape == (2, 67, 3) and np.array_equal(found[:, :25], [points(25)] * 2)
+    assert np.array_equal(found[0, 25:46], left) and not found[0, 46:].any() and not found[1, 25:].any()
+    rec.write_keypoints(path, [points(25)], [([], [])])
+    assert read_openpose(path).shape == (1, 25, 3)
+    assert [p.shape[1] for p in pad_hands([found, read_openpose(path), np.zeros((0, 0, 3))])] == [67, 67, 0]
+    assert np.array_equal(pad_hands([found, read_openpose(path)])[1][0, :25], points(25))
+
+
+@pytest.mark.parametrize(
+    ("hands", "message"),
+    [
+        ((points(20), points(20)), "a hand has 21 points"),
+        ((points(20), points(22)), "not triples of numbers"),
+        ((points(21) * np.nan, []), "NaN"),
+    ],
+)
+def test_hands_that_are_no_hands_are_refused(tmp_path: Path, hands: tuple, message: str) -> None:
+    rec.write_keypoints(tmp_path / "a.json", [points(25)], [hands])
+    with pytest.raises(InputError, match=rf"a\.json: .*{message}"):
+        read_openpose(tmp_path / "a.json")
+
+
+def test_recorded_hands_are_ingested_like_keypoints(tmp_path: Path) -> None:
+    """Camera 01 has hands in all frames but the first, 02 has none. If images shrink from 24 x 16 to 16 x 11 px, x
+    becomes 2 x / 3 - 1 / 6, and y becomes 11 y / 16 - 5 / 32."""
+    folder = rec.write_easymocap(tmp_path / "person")
+    for frame in rec.FRAMES[1:]:
+        hands = (np.tile([4.0 + frame, 6, 0.75], (21, 1)), np.tile([20.0, 10, 0.25], (21, 1)))
+        person = np.tile([3.0 + frame, 5, 0.5], (25, 1))
+        rec.write_keypoints(folder / "openpose" / "01" / f"{frame:06d}_keypoints.json", [person], [hands])
+    whole = ingest(folder, CaptureSettings(), tmp_path / "whole")
+    small = ingest(folder, CaptureSettings(max_side_px=16), tmp_path / "small")
+    given, shrunk = whole.given_hands("01"), small.given_hands("01")
+    assert whole.has_given_hands and whole.given_hands("02") is None
+    assert given is not None and given.shape == (5, 1, 2, 21, 3) and not given[0].any()
+    assert given[3, 0, :, 20].tolist() == [[7, 6, 0.75], [20, 10, 0.25]]
+    assert shrunk is not None
+    assert shrunk[3, 0, 0, 20].tolist() == pytest.approx([7 * 2 / 3 - 1 / 6, 6 * 11 / 16 - 5 / 32, 0.75])
+    keypoints = whole.keypoints("01")
+    assert keypoints is not None and keypoints[:, 0, 3].tolist() == [[3 + frame, 5, 0.5] for frame in rec.FRAMES]
+
+
+def test_a_recording_without_hands_has_no_file_of_hands(tmp_path: Path) -> None:
+    assert not ingest(rec.write_easymocap(tmp_path / "person"), CaptureSettings(), tmp_path / "out").has_given_hands
 
 
 def test_points_that_were_not_seen_may_have_any_position(tmp_path: Path) -> None:

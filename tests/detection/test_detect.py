@@ -55,6 +55,13 @@ def test_with_source_both_the_recordings_own_keypoints_are_kept_and_completed(
     assert kept[:, 0, 11].tolist() == [[5, 4, 0.5]] * 5 and (np.delete(kept, 11, 2) == [5, 4, 0.9]).all()
 
 
+def test_recorded_hands_are_kept_with_the_recorded_people_only(recording: Capture, tmp_path: Path) -> None:
+    np.savez(recording.root / "given_hands.npz", **{"01": np.ones((5, 1, 2, 21, 3))})
+    for settings, kept in ((NETWORK, False), (BOTH, True)):
+        detect(recording, settings, tmp_path / str(settings.source))
+        assert Capture.load(tmp_path / str(settings.source)).has_given_hands is kept
+
+
 def test_cameras_that_are_done_are_not_processed_again(recording: Capture, tmp_path: Path) -> None:
     detect(recording, NETWORK, tmp_path / "out")
     detect(recording, NETWORK, tmp_path / "out")

@@ -1,5 +1,6 @@
 """Where hands are searched for, and which points are kept; numbers worked out by hand."""
 
+import itertools
 import math
 import threading
 from pathlib import Path
@@ -12,9 +13,16 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from hnerf.detection import hands
-from hnerf.detection.hands import HandNetwork, detect_hands, find_hands, forearm_region, hand_region
+from hnerf.detection.hands import (
+    HandNetwork,
+    detect_hands,
+    find_hands,
+    forearm_region,
+    given_hands,
+    hand_region,
+)
 from hnerf.detection.region import Region
-from tests.capture.recordings import write_easymocap
+from tests.capture.recordings import CAMERAS, FRAMES, write_easymocap, write_keypoints
 
 IMAGE = np.zeros((400, 400, 3), np.uint8)
 
@@ -102,6 +110,7 @@ def test_each_thread_has_its_own_network_and_hands_keep_the_order_of_images(
 
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     monkeypatch.setattr(hands, "subject_keypoints", lambda recording: people)
+    monkeypatch.setattr(hands, "has_model", lambda name: True)
     monkeypatch.setattr(hands, "Network", lambda name: object())
     monkeypatch.setattr(hands, "find_hands", find)
     assert detect_hands(capture, tmp_path / "out") == {"01": 0.8, "02": 1.0}
@@ -111,3 +120,43 @@ def test_each_thread_has_its_own_network_and_hands_keep_the_order_of_images(
         points, own = written.hands(name), written.keypoints(name)
         assert points is not None and points.shape == (5, 2, 21, 3) and points[:, 0, 0, 0].tolist() == row.tolist()
         assert own is not None and np.array_equal(own, capture.keypoints(name)) and capture.hands(name) is None
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_hands_of_the_recordings_own_files_are_used_before_the_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, installed: bool
+) -> None:
+    """Files of camera 01 have hands in three of the five frames that show the subject, those of camera 02 in two. The
+    subject comes second in each file, after a stranger with other hands; the network, which is searched for the
+    subject's hands, finds hands at (1, 1)."""
+    folder = write_easymocap(tmp_path / "folder")
+    for camera, frame in itertools.product(CAMERAS, FRAMES):
+        people = [np.tile([x, 5.0, 0.5], (25, 1)) for x in (3, 12)]
+        shown = frame < {"01": 3, "02": 2}[camera]
+        given = [(np.tile([x, frame, 0.75], (21, 1)), []) if shown else ([], []) for x in (4, 13)]
+        write_keypoints(folder / "openpose" / camera / f"{frame:06d}_keypoints.json", people, given)
+    capture = ingest(folder, CaptureSettings(), tmp_path / "capture")
+    subject = np.tile([12.0, 5, 0.5], (5, 25, 1))
+    monkeypatch.setattr(hands, "subject_keypoints", lambda recording: dict.fromkeys(CAMERAS, subject))
+    monkeypatch.setattr(hands, "has_model", lambda name: installed)
+    monkeypatch.setattr(hands, "Network", lambda name: object())
+    monkeypatch.setattr(hands, "find_hands", lambda image, keypoints, network: np.ones((2, 21, 3)))
+    shares = detect_hands(capture, tmp_path / "out")
+    one, two = (Capture.load(tmp_path / "out").hands(name) for name in CAMERAS)
+    assert one is not None and two is not None
+    left = [[13, 0, 0.75], [13, 1, 0.75], [13, 2, 0.75], [0, 0, 0], [0, 0, 0]]
+    assert one[:, 0, 20].tolist() == left and not one[:, 1].any()
+    assert two[:, 0, 20].tolist() == ([[1, 1, 1]] * 5 if installed else [*left[:2], *[[0, 0, 0]] * 3])
+    assert shares == {"01": 0.3, "02": 1.0 if installed else 0.2}
+
+
+def test_a_person_whom_a_network_added_has_no_recorded_hands(tmp_path: Path) -> None:
+    """In frame 2, keypoints are of a network's two people, of whom the subject is the second; the recording has one
+    person's hands."""
+    capture = ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
+    keypoints = np.zeros((5, 2, 25, 3))
+    keypoints[:, 0], keypoints[2, :] = [12, 5, 0.5], [[[3, 5, 0.5]], [[12, 5, 0.5]]]
+    np.savez(capture.root / "keypoints.npz", **{"01": keypoints})
+    np.savez(capture.root / "given_hands.npz", **{"01": np.ones((5, 1, 2, 21, 3))})
+    found = given_hands(capture, "01", np.tile([12.0, 5, 0.5], (5, 25, 1)))
+    assert found[:, 0, 0, 0].tolist() == [1, 1, 0, 1, 1]

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
@@ -55,13 +56,16 @@ def test_a_single_camera_needs_detection_for_the_depth_of_limbs(
     assert not needs_detection(recording, DetectionSettings())
 
 
-def test_hand_detection_needs_a_network_keypoints_two_cameras_and_the_setting(
+def test_hand_detection_needs_hands_or_a_network_keypoints_two_cameras_and_the_setting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "models"))
     ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
     recording = Artifact(stage="capture", root=tmp_path / "capture", files={})
     assert not needs_hands(recording, DetectionSettings())
+    np.savez(tmp_path / "capture" / "given_hands.npz")
+    assert needs_hands(recording, DetectionSettings()) and not needs_hands(recording, DetectionSettings(hands="none"))
+    (tmp_path / "capture" / "given_hands.npz").unlink()
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / HAND_LANDMARKS).touch()
     assert needs_hands(recording, DetectionSettings())
