@@ -28,6 +28,7 @@ from hnerf.body.observations import Observations, observe, runs
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.posture_prior import PosturePrior
 from hnerf.body.reprojection import project
+from hnerf.body.standing_feet import StandingFeet
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.capture.timing import median_step, nearest_rows
@@ -100,6 +101,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
             with timed("outlines", seconds, log):
                 problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
                 problem = replace(problem, limb_depths=limb_depths, balance=balance, palm=palm)
+                problem = replace(problem, standing_feet=StandingFeet.of_pose(pose, runs(capture), capture.fps))
                 problem = replace(problem, ground=ground and Ground(up, each_foot=True), posture_prior=posture_prior)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 pose = refine_with_outlines(problem, pose, edges, up if ground else None, threads)

@@ -17,6 +17,7 @@ from hnerf.body.observations import Observations
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.posture_prior import PosturePrior
 from hnerf.body.reprojection import NEAR_M, DataTerm, reprojection_term
+from hnerf.body.standing_feet import StandingFeet
 from hnerf.config import FitSettings
 from hnerf.geometry.camera import Camera
 
@@ -47,6 +48,7 @@ class Problem:
     posture_prior: PosturePrior | None = None
     palm: PalmTerm | None = None
     limb_depths: LimbDepths | None = None
+    standing_feet: StandingFeet | None = None
 
     def assemble(self, pose: Pose) -> tuple[float, NormalEquations]:
         """Return the cost and the normal equations of the keypoints and of all priors."""
@@ -63,6 +65,8 @@ class Problem:
         cost += self._add_shape_prior(equations, pose)
         cost += PosePrior(articulation).add(equations, pose)
         cost += self.smoothness.add(equations, x, by_frame)
+        if self.standing_feet:
+            cost += self.standing_feet.add(equations, x, by_frame)
         if self.balance:
             cost += self.balance.add(equations, x, by_frame)
         if self.ground:
