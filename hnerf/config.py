@@ -305,7 +305,7 @@ class AssetSettings(Section):
     topology: Literal["auto", "registered", "captured", "both"] = "auto"  # of the mesh: see docs/asset.md, Both meshes
     faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered mesh has the body model's
     level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # most triangles of each lower level of detail
-    texture_px: int = Field(default=1024, ge=16, le=8192)  # side of the texture
+    texture_px: int | None = Field(default=None, ge=16, le=8192)  # side of the texture; null: see docs/asset.md
     texture_poses: int = Field(default=3, ge=1)  # poses whose median gives the field's colour of a texel
     photograph_frames: int = Field(default=16, ge=0)  # most frames photographed for the texture; 0: the field alone
     normal_map_px: int = Field(default=0, ge=0, le=8192)  # side of the normal map; 0: none, since it shows grid cells

@@ -46,24 +46,25 @@ def baked_textures(
     clothed: BodyFit,
     surfaces_m: np.ndarray,
     layout: UvLayout,
+    texture_px: int,
     settings: AssetSettings,
     cavities: np.ndarray,
 ) -> tuple[np.ndarray, Albedo | None, Filled]:
     """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, its albedo, None if the texture is the field's
     alone, and what the field fills.
 
-    surfaces_m (n, V, 3): the body's surface in the world in each frame; cavities (V,) bool: vertices deep inside mouth
-    and nose, which are darkened because little light reaches them.
+    surfaces_m (n, V, 3): the body's surface in the world in each frame; texture_px: side of the texture; cavities (V,)
+    bool: vertices deep inside mouth and nose, which are darkened because little light reaches them.
     """
-    texels, faces = rasterise(layout, settings.texture_px), clothed.rig.faces.numpy()
+    texels, faces = rasterise(layout, texture_px), clothed.rig.faces.numpy()
     lit = texels.interpolate(np.where(cavities, CAVITY_BRIGHTNESS, 1.0)[:, None], faces)
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
     if not settings.photograph_frames:
         field = field_colours(avatar, posed, texels, cavities)
-        filled = Filled.of(texels, np.ones(len(field), bool), settings.texture_px)
-        return texture_image(texels, field * lit, settings.texture_px), None, filled
-    field = _coarse_field_colours(avatar, posed, layout, texels, settings.texture_px, cavities)
-    frames = photographed_frames(capture, settings)
+        filled = Filled.of(texels, np.ones(len(field), bool), texture_px)
+        return texture_image(texels, field * lit, texture_px), None, filled
+    field = _coarse_field_colours(avatar, posed, layout, texels, texture_px, cavities)
+    frames = photographed_frames(capture, settings.photograph_frames, texture_px)
     photographed = {frame: SeenSurface.of(surfaces_m[clothed.index(frame)], faces) for frame in frames}
     light = fit_light(photographed_shading(capture, avatar.gains, photographed))
     seen_by_field = [surfaces_m[clothed.index(frame)] for frame in posed.frames]
@@ -74,18 +75,18 @@ def baked_textures(
         albedo.add(seen)
 
     def finished(blend: CapturedBlend | AlbedoBlend) -> np.ndarray:
-        return texture_image(texels, blend.colours() * lit, settings.texture_px)
+        return texture_image(texels, blend.colours() * lit, texture_px)
 
     blends: list[CapturedBlend | AlbedoBlend] = [captured, albedo]
     texture, delit = side_by_side(finished, blends)
-    return texture, Albedo(delit, light), Filled.of(texels, captured.unseen, settings.texture_px)
+    return texture, Albedo(delit, light), Filled.of(texels, captured.unseen, texture_px)
 
 
-def photographed_frames(capture: Capture, settings: AssetSettings) -> list[int]:
-    """Return the training frames whose photographs make the texture: fewer than the settings ask for if cameras are so
-    many, or the texture so large, that they would take gigabytes."""
-    affordable = MOST_TEXELS // (settings.texture_px**2 * len(capture.train_cameras))
-    return evenly_spaced(capture.train_frames, min(settings.photograph_frames, max(1, affordable)))
+def photographed_frames(capture: Capture, most: int, texture_px: int) -> list[int]:
+    """Return the training frames whose photographs make the texture: fewer than `most` if cameras are so many, or the
+    texture so large, that they would take gigabytes."""
+    affordable = MOST_TEXELS // (texture_px**2 * len(capture.train_cameras))
+    return evenly_spaced(capture.train_frames, min(most, max(1, affordable)))
 
 
 def _coarse_field_colours(

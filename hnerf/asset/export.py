@@ -29,6 +29,7 @@ from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.splat_ply import write_splat_ply
 from hnerf.asset.splats import Splats, surface_splats
 from hnerf.asset.staging import StagedAvatar, stage_avatar
+from hnerf.asset.texture_size import TextureSize, texture_size
 from hnerf.asset.topologies import AssetMesh, captured_mesh, registered_mesh
 from hnerf.asset.validation import validate_package
 from hnerf.asset.viewer import write_viewer
@@ -38,6 +39,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
+from hnerf.evenly_spaced import evenly_spaced
 from hnerf.progress import timed
 from hnerf.render.motion import Motion, retarget, select_poses
 
@@ -71,11 +73,12 @@ class ClothedSurface:
 
 @dataclass(frozen=True)
 class MeshAsset:
-    """The asset of one mesh: what is written of it, what of its texture the field fills, its views next to the field's
-    with their figures, and the seconds of each step."""
+    """The asset of one mesh: what is written of it, the size of its texture, what of it the field fills, its views next
+    to the field's with their figures, and the seconds of each step."""
 
     surface: ClothedSurface
     staged: StagedAvatar
+    texture_size: TextureSize
     filled: Filled
     splats: Splats | None
     compared: list[Compared]
@@ -121,7 +124,8 @@ def export_asset(
     with timed("poses", seconds, log):
         poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
     with timed("files", seconds, log):
-        chosen, close = settings.model_dump(exclude={"version", "licence"}), _closeness(meshes, asset, topology)
+        chosen = settings.model_dump(exclude={"version", "licence"}) | {"texture_px": asset.texture_size.px}
+        close = _closeness(meshes, asset, topology)
         info = AssetInfo(capture.name, settings.version, settings.licence, digest, chosen, close)
         avatars = {"registered": staged, "captured": captured.staged} if captured else {"": staged}
         write_files(out, avatars, capture, info, splats)
@@ -183,10 +187,12 @@ def _mesh_asset(
     with timed("correctives", seconds, log):
         surface = _clothed_surface(capture, avatar, meshes.by_topology[topology], settings)
     mesh = surface.mesh
-    layout = mesh.layout(settings.texture_px)
     with timed("texture", seconds, log):
+        frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
+        photographed_m = [surface.surfaces_m[surface.body.index(frame)] for frame in frames]
+        size, layout = texture_size(capture, photographed_m, mesh, settings.texture_px)
         texture, albedo, filled = baked_textures(
-            capture, timeless, surface.body, surface.surfaces_m, layout, settings, mesh.cavities
+            capture, timeless, surface.body, surface.surfaces_m, layout, size.px, settings, mesh.cavities
         )
     with timed("normal map", seconds, log):
         px = settings.normal_map_px
@@ -214,7 +220,7 @@ def _mesh_asset(
         compared = compare_with_field(capture, masks, avatar, staged, splats)
         against_field = comparison_figures(compared)
     require_close(capture.name, topology, against_field, settings.allow_poor)
-    return MeshAsset(surface, staged, filled, splats, compared, against_field, seconds)
+    return MeshAsset(surface, staged, size, filled, splats, compared, against_field, seconds)
 
 
 def _clothed_surface(capture: Capture, avatar: Avatar, mesh: AssetMesh, settings: AssetSettings) -> ClothedSurface:
@@ -239,7 +245,6 @@ def _figures(
         "surface": {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume},
         **_mesh_asset_figures(asset, topology),
         "to_surface_mm": meshes.distances_mm,
-        "texture_px": settings.texture_px,
         "normal_map_px": settings.normal_map_px,
         "light": light and {"coefficients": light.coefficients.round(4).tolist(), "normals_turned_deg": light.turn_deg},
         "expressions": list(staged.expressions_m),
@@ -265,6 +270,7 @@ def _mesh_asset_figures(asset: MeshAsset, topology: str) -> dict[str, Any]:
     return {
         "mesh": mesh_figures(topology, surface.mesh, asset.staged),
         "levels": level_figures(asset.staged),
+        **asset.texture_size.figures(),
         "filled_share": asset.filled.share,
         "beyond_skinning_mm": beyond_skinning_mm(surface.displacements_m, surface.correctives),
         "against_field": asset.against_field,

@@ -22,7 +22,7 @@ from tests.asset.stand_in import StandInAvatar
 
 SUN = Light(np.array([0.7, 0, 0, -0.26, 0, 0, 0, 0, 0]), 0.0)  # E = 0.7 - 0.3 x
 GREY = 0.4
-SETTINGS = AssetSettings(texture_px=64, texture_poses=1, photograph_frames=3)
+SETTINGS = AssetSettings(texture_poses=1, photograph_frames=3)
 
 
 @dataclass
@@ -62,7 +62,7 @@ def test_the_albedo_of_a_uniform_column_is_uniform(pictures: dict[int, np.ndarra
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
     texture, albedo, _ = baked_textures(
-        capture, Grey(body), body, surfaces_m, layout, SETTINGS, figure.no_cavities(body)
+        capture, Grey(body), body, surfaces_m, layout, 64, SETTINGS, figure.no_cavities(body)
     )
     assert albedo is not None
     light = albedo.light.coefficients / albedo.light.coefficients[0]
@@ -79,8 +79,8 @@ def test_the_field_fills_what_no_photograph_shows(pictures: dict[int, np.ndarray
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
     settings = SETTINGS.model_copy(update={"photograph_frames": 1})
-    *_, filled = baked_textures(capture, Grey(body), body, surfaces_m, layout, settings, figure.no_cavities(body))
-    (frame,), faces, texels = photographed_frames(capture, settings), body.rig.faces.numpy(), rasterise(layout, 64)
+    *_, filled = baked_textures(capture, Grey(body), body, surfaces_m, layout, 64, settings, figure.no_cavities(body))
+    (frame,), faces, texels = photographed_frames(capture, 1, 64), body.rig.faces.numpy(), rasterise(layout, 64)
     corners_m = surfaces_m[body.index(frame)][faces]
     normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
     away = (normals * (figure.side_camera().centre_m - corners_m.mean(1))).sum(1) < 0
@@ -95,7 +95,7 @@ def test_there_is_no_albedo_without_photographs() -> None:
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     settings = SETTINGS.model_copy(update={"photograph_frames": 0})
     texture, albedo, filled = baked_textures(
-        figure.capture(), Grey(body), body, np.zeros(0), layout, settings, figure.no_cavities(body)
+        figure.capture(), Grey(body), body, np.zeros(0), layout, 64, settings, figure.no_cavities(body)
     )
     assert albedo is None and texture.shape == (64, 64, 3) and filled.share == 1
 
@@ -111,7 +111,7 @@ def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
     for photographs in (0, 3):
         settings, shown = SETTINGS.model_copy(update={"photograph_frames": photographs}), []
         for cavities in (figure.no_cavities(body), vertices_m[:, 2] > 0.85):
-            texture, *_ = baked_textures(capture, Grey(body), body, surfaces_m, layout, settings, cavities)
+            texture, *_ = baked_textures(capture, Grey(body), body, surfaces_m, layout, 64, settings, cavities)
             shown.append(texture[texels.row, texels.column, 0].astype(float))
         ratio = shown[1] / shown[0]
         assert np.median(ratio[z_m.min(1) > 0.85]) == pytest.approx(CAVITY_BRIGHTNESS, abs=0.05)
@@ -123,8 +123,4 @@ def test_many_cameras_or_a_large_texture_take_fewer_frames() -> None:
     capture = dataclasses.replace(
         figure.capture(), train_cameras=tuple(f"{k}" for k in range(64)), train_frames=tuple(range(100))
     )
-    counts = [
-        len(photographed_frames(capture, AssetSettings(texture_px=side_px, photograph_frames=16)))
-        for side_px in (512, 1024, 4096)
-    ]
-    assert counts == [16, 8, 1]
+    assert [len(photographed_frames(capture, 16, side_px)) for side_px in (512, 1024, 4096)] == [16, 8, 1]

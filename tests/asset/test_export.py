@@ -18,6 +18,7 @@ from hnerf.errors import InputError, InvalidAsset
 from hnerf.render.motion import Motion, select_poses
 from tests.asset.figure import bending_body, capture, column_rig
 from tests.asset.stand_in import StandInAvatar
+from tests.asset.test_baking import Pictured
 
 SMALL = AssetSettings(
     grid_cells=96,
@@ -100,6 +101,7 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
     assert [report["levels"][lod]["triangles"] for lod in ("lod0", "lod1")] == [report["mesh"]["faces"], 500]
     assert report["light"] is None and report["filled_share"] == 1  # no light without photographs
+    assert (report["texture_px"], report["source_pixel_mm"]) == (128, None)
     assert (report["frames"], report["joints"], report["cameras"]) == (4, 3, 1)
     assert report["rigs"]["game"]["influences"] == 2 and report["rigs"]["game"]["moved_max_mm"] < 0.01
     assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}
@@ -156,6 +158,28 @@ def test_the_captured_mesh_replaces_a_registered_one_that_does_not_follow(
     lines = [r.message.removeprefix("column: ") for r in caplog.records if "the registered mesh" in r.message]
     assert lines == report["findings"] and bool(lines) == (chosen == "captured")
     assert all(line.endswith("The asset has the captured mesh") for line in lines)
+
+
+@pytest.mark.usefixtures("small_report")
+def test_the_photographs_decide_on_the_size_of_the_texture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The column's front is 4.85 m from a camera of 500 px: a pixel is 9.7 mm wide. Its surface of 1.6 m² fills about
+    half of the texture: half a pixel is a 370th of the texture's width."""
+    monkeypatch.setattr("hnerf.asset.texture_size.SMALLEST_PX", 64)
+    photographs = dict.fromkeys(range(10), np.zeros((480, 640, 3), np.uint8))
+    settings = TINY.model_copy(update={"texture_px": None, "photograph_frames": 2, "topology": "both"})
+    recorded = Pictured(**vars(capture()), pictures=photographs)
+    with caplog.at_level("INFO"):
+        report = export_asset(recorded, Masks({}, {}), StandInAvatar(bending_body()), settings, tmp_path)
+    for figures in (report, report["captured"]):
+        assert figures["texture_px"] in (256, 512)
+        assert figures["source_pixel_mm"] == pytest.approx(9.7, abs=0.1)
+        assert figures["texel_mm"] == pytest.approx(1e3 * np.sqrt(1.6 / 0.5) / figures["texture_px"], rel=0.2)
+    line = "column: texture of {} px, {:.2g} mm a texel; photographs have pixels down to 9.7 mm"
+    assert line.format(report["texture_px"], report["texel_mm"]) in [record.message for record in caplog.records]
+    stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
+    assert stage.GetDefaultPrim().GetAssetInfo()["settings"]["texture_px"] == report["texture_px"]
 
 
 @pytest.mark.usefixtures("small_report")
