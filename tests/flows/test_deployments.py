@@ -1,7 +1,5 @@
+import contextlib
 import json
-import os
-import subprocess
-import sys
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +14,7 @@ from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.deployments import run_deployment
 from prefect.exceptions import PrefectHTTPStatusError
 from prefect.states import Crashed
+from prefect.testing.cli import invoke_and_assert
 
 from flows import restart
 from flows.restart import RELEASE, restart_crashed, unfinished_runs
@@ -30,10 +29,8 @@ def deployed(prefect_api: str) -> str:
     """Return the URL of a server that has the deployments of prefect.yaml."""
     with get_client(sync_client=True) as client:
         client.create_work_pool(WorkPoolCreate(name="local", type="process"))
-    environment = os.environ | {"PREFECT_API_URL": prefect_api}
-    command = [sys.executable, "-m", "prefect", "--no-prompt", "deploy", "--all"]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    with contextlib.chdir(ROOT):
+        invoke_and_assert(["--no-prompt", "deploy", "--all"])
     return prefect_api
 
 
