@@ -15,8 +15,6 @@ from prefect.client.schemas.actions import WorkPoolCreate
 from prefect.client.schemas.objects import FlowRun
 from prefect.utilities.templating import find_placeholders
 from prefect.workers.base import BaseJobConfiguration, BaseWorker
-from prefect_docker.worker import DockerWorker
-from prefect_kubernetes.worker import KubernetesWorker
 
 POOLS = Path(__file__).parents[2] / "configs" / "work_pools"
 RUN = FlowRun(id=UUID(int=7), flow_id=UUID(int=8), name="captures/Ada #1")
@@ -27,8 +25,21 @@ def template(pool: str) -> dict[str, Any]:
     return json.loads((POOLS / f"{pool}.json").read_text())  # type: ignore[no-any-return]
 
 
-def prepared(worker: type[BaseWorker], **values: object) -> BaseJobConfiguration:
-    """Return the job that a worker makes from our template for a run with these job variables."""
+def worker_of(pool: str) -> type[BaseWorker]:
+    """Return the worker of a pool. Its library is imported only here, because every process of the tests imports this
+    file, and only one needs the library."""
+    if pool == "docker":
+        from prefect_docker.worker import DockerWorker
+
+        return DockerWorker
+    from prefect_kubernetes.worker import KubernetesWorker
+
+    return KubernetesWorker
+
+
+def prepared(pool: str, **values: object) -> BaseJobConfiguration:
+    """Return the job that a pool's worker makes from our template for a run with these job variables."""
+    worker = worker_of(pool)
     make = worker.job_configuration.from_template_and_values
     job = asyncio.run(make(template(worker.type), values, client=object()))
     job.prepare_for_flow_run(RUN)
@@ -37,7 +48,7 @@ def prepared(worker: type[BaseWorker], **values: object) -> BaseJobConfiguration
 
 def manifest(**values: object) -> dict[str, Any]:
     """Return the manifest of a job, without the keys that Prefect puts in the wrong place (NOT_OURS)."""
-    made: dict[str, Any] = prepared(KubernetesWorker, **values).job_manifest
+    made: dict[str, Any] = prepared("kubernetes", **values).job_manifest
     pod = made["spec"]["template"]["spec"]
     made["spec"]["template"]["spec"] = {key: value for key, value in pod.items() if key not in NOT_OURS}
     return made
@@ -59,14 +70,14 @@ def test_variables_are_declared_and_used(pool: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("worker", "replaced"),
+    ("pool", "replaced"),
     [
-        (DockerWorker, {"command", "memswap_limit", "privileged", "container_create_kwargs"}),
-        (KubernetesWorker, {"cpu_request", "memory_request"}),
+        ("docker", {"command", "memswap_limit", "privileged", "container_create_kwargs"}),
+        ("kubernetes", {"cpu_request", "memory_request"}),
     ],
 )
-def test_templates_have_the_variables_of_the_installed_prefect(worker: type[BaseWorker], replaced: set[str]) -> None:
-    default, ours = worker.get_default_base_job_template(), template(worker.type)
+def test_templates_have_the_variables_of_the_installed_prefect(pool: str, replaced: set[str]) -> None:
+    default, ours = worker_of(pool).get_default_base_job_template(), template(pool)
     assert set(ours["job_configuration"]) == set(default["job_configuration"])
     assert set(default["variables"]["properties"]) - set(ours["variables"]["properties"]) == replaced
 
@@ -98,8 +109,8 @@ def test_variables_reach_the_job() -> None:
 
 def docker_settings(**values: object) -> dict[str, Any]:
     """Return the container settings that the worker sends to Docker."""
-    job = prepared(DockerWorker, env={"PREFECT_API_URL": "https://example.org/api"}, **values)
-    return DockerWorker._build_container_settings(None, None, job)  # type: ignore[no-any-return]
+    job = prepared("docker", env={"PREFECT_API_URL": "https://example.org/api"}, **values)
+    return worker_of("docker")._build_container_settings(None, None, job)  # type: ignore[no-any-return]
 
 
 def test_docker_containers_get_a_gpu_limits_and_the_folders_of_the_checkout(
