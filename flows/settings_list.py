@@ -4,6 +4,7 @@ import inspect
 import json
 import re
 from collections.abc import Iterator
+from functools import cache
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -18,7 +19,7 @@ FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
 def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Iterator[str]:
     """Yield a line for each setting, `key=value  type  description`; settings of nested sections have their section's
     key as prefix. kinds: the available kinds, for a section that can be one of several."""
-    about = dict(FIELD.findall("\n".join(inspect.getsource(kind) for kind in _sections(type(settings)))))
+    about = {name: text for kind in _sections(type(settings)) for name, text in _comments(kind).items()}
     for name, field in type(settings).model_fields.items():
         value = getattr(settings, name)
         if isinstance(value, Section):
@@ -33,6 +34,12 @@ def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Itera
 def _sections(kind: type[Section]) -> list[type]:
     """Return the class and its bases that may have settings, bases first."""
     return [base for base in reversed(kind.__mro__) if issubclass(base, Section)]
+
+
+@cache  # Python parses a class's whole file to find its source
+def _comments(kind: type) -> dict[str, str]:
+    """Return the comments next to the settings that a class itself defines."""
+    return dict(FIELD.findall(inspect.getsource(kind)))
 
 
 def _type(field: FieldInfo) -> str:
