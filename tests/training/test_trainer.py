@@ -23,7 +23,7 @@ from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint, tr
 from hnerf.training.pixels import PixelRays, Pixels
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer, train
-from tests.training.scene import ALONE, FRAMES, TINY, record, tiny
+from tests.training.scene import ALONE, FRAMES, TINY, TINY_FIELDS, record, tiny
 
 pytestmark = pytest.mark.usefixtures("any_surface")
 
@@ -367,14 +367,20 @@ def test_a_full_disk_is_an_os_error_and_leaves_no_partial_checkpoint(tmp_path: P
 
 
 def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path):
-    """The published method draws uniformly from all pixels; a composited field needs pixels near the person."""
+    """The published method draws uniformly from all pixels; a composited field needs pixels near the person, more of
+    them where its colours are wrong."""
     scene = record(tmp_path)
     height, width = scene[0].image("0", 0).shape[:2]
     images = len(scene[0].train_cameras) * len(scene[2].frames)
-    for kind, whole in (("paper", True), ("fast", False)):
-        trainer = Trainer(*scene, tiny(kind), tmp_path / "out", ALONE)
+    in_box = TINY_FIELDS["paper"] | {"rays": "box"}
+    for settings, whole, uniform in (
+        (tiny("paper"), True, True),
+        (tiny("paper", field=in_box), False, True),
+        (tiny("fast"), False, False),
+    ):
+        trainer = Trainer(*scene, settings, tmp_path / "out", ALONE)
         assert (len(trainer.pixels.edge) == images * height * width) == whole
-        assert (trainer.errors is None) == whole
+        assert (trainer.errors is None) == uniform
 
 
 def test_the_number_of_rays_per_step_does_not_depend_on_the_number_of_frames(
