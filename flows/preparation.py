@@ -25,8 +25,8 @@ class Prepared(NamedTuple):
 
 
 def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
-    """Return the recording with people detected by a network, if it needs that, and with keypoints of the subject's
-    hands, if they are wanted and the network is installed."""
+    """Return the recording with people detected by a network, if it needs that, and with points of the subject's
+    hands, if they are wanted, and the recording has them or the network is installed."""
     recording = recorded
     if needs_detection(recorded, settings.detection):
         recording = detect(store, recorded, settings.detection)

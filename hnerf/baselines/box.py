@@ -24,8 +24,8 @@ class BoxField(Field):
 
     The methods were published for a bounded object, a person cut out of the image, or a whole scene; here the
     background comes from the clean plate, so rays are sampled in the person's box only. Training draws rays from all
-    pixels that see the box, by the errors of cells, as for H-NeRF's preset `fast`. Outside the box the networks were
-    never trained, so the surface ends there.
+    pixels that see the box, more of them where colours are wrong, as for H-NeRF's preset `fast`. Outside the box the
+    networks were never trained, so the surface ends there.
     """
 
     centre_m: Tensor

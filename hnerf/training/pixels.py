@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hnerf.fields.rays import Rays
 
-CELL_PX = 4
+CELL_PX = 4  # side of the squares of pixels that share an error
 LEAST_ERROR = 1e-6  # of a cell that a ray has met
 CANDIDATES = 4  # per ray, of which the one in the cell with the largest error is drawn (docs/experiments.md)
 
