@@ -13,7 +13,7 @@ from typing import Any
 from prefect import flow
 
 from flows.arguments import StoreFolder
-from flows.preparation import prepare_training, with_detections
+from flows.preparation import ingest_recording, prepare_training, with_detections
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, title_of, with_changes
@@ -21,7 +21,6 @@ from hnerf.errors import InputError, one_line
 from hnerf.files import replace_text
 from hnerf.study.benchmark import results
 from hnerf.tables import pick, table
-from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
@@ -62,7 +61,7 @@ def ablate(
     set_limits(rows[FULL].limits)
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    subject = Capture.load(ingest(artifact_store, source, rows[FULL].capture).root).name
+    subject = Capture.load(ingest_recording(artifact_store, source, rows[FULL]).root).name
     table = artifact_store.root / "ablations" / f"{subject}-{title_of(preset)}{'-part' if only else ''}.md"
     artifact_store.claim_table(table, source.digest, source.root)
     result: dict[str, Any] = {"subject": subject, "preset": preset, "overrides": overrides, "left_out": left_out}
@@ -97,7 +96,7 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
 def measure(store: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
     """Return a row: the scores of every split, and the seconds and device of its training; {"error": one line} if it
     fails."""
-    recording = with_detections(store, ingest(store, source, settings.capture), settings)
+    recording = with_detections(store, ingest_recording(store, source, settings), settings)
     prepared = prepare_training(store, recording, settings)
     try:
         training = train(store, *prepared, settings.training)

@@ -9,7 +9,7 @@ from prefect import flow
 from pydantic import Field
 
 from flows.arguments import StoreFolder
-from flows.preparation import Prepared, ingest_part, prepare_training
+from flows.preparation import Prepared, ingest_part, ingest_recording, prepare_training
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, title_of
@@ -21,7 +21,6 @@ from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
 from hnerf.study.benchmark.publish import publish, table_path
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated_capture
-from tasks.capture import ingest
 from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
 from tasks.source import GROUND_TRUTH, Source, read_capture
@@ -59,7 +58,7 @@ def benchmark(
     set_limits(first.limits)
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    recorded = Capture.load(ingest(artifact_store, source, first.capture).root)
+    recorded = Capture.load(ingest_recording(artifact_store, source, first).root)
     if plan.until_flat and not (recorded.test_cameras and truth_of(truth.root, recorded).has_masks):
         raise InputError(
             f"{recorded.name}: no image can be scored, so no curve can become flat; add test cameras with masks, or "

@@ -68,9 +68,8 @@ def _write_capture(out: Path, settings: SyntheticSettings) -> None:
 
 def check_cameras(options: argparse.Namespace) -> None:
     """Check the calibration of a capture, and print a verdict for each camera."""
-    from flows.preparation import with_detections
+    from flows.preparation import ingest_recording, with_detections
     from tasks.calibration import calibrate
-    from tasks.capture import ingest
     from tasks.limits import set_limits
     from tasks.source import read_capture
     from tasks.store import Store
@@ -78,7 +77,7 @@ def check_cameras(options: argparse.Namespace) -> None:
     settings, store = load_settings(options.preset), Store(options.store.resolve())
     set_limits(settings.limits)
     source, _ = read_capture(options.capture, options.store)
-    recording = with_detections(store, ingest(store, source, settings.capture), settings)
+    recording = with_detections(store, ingest_recording(store, source, settings), settings)
     calibration = calibrate(store, recording, settings.calibration)
     print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))
     print(f"picture: {calibration.root / 'cameras.png'}")

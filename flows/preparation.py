@@ -3,9 +3,11 @@
 from typing import NamedTuple
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import lacks_calibration
 from hnerf.config import Settings
 from hnerf.study.benchmark.plan import CapturePart
 from tasks.calibration import calibrate
+from tasks.cameras import find_cameras
 from tasks.capture import ingest, subset_capture
 from tasks.detection import detect, find_hands, needs_detection, needs_hands
 from tasks.fit import fit
@@ -24,6 +26,16 @@ class Prepared(NamedTuple):
     body: Artifact
 
 
+def missing_cameras(store: Store, source: Source) -> Artifact | None:
+    """Return clocks and cameras found from the person, if several cameras have no calibration; else None."""
+    return find_cameras(store, source) if lacks_calibration(source.root) else None
+
+
+def ingest_recording(store: Store, source: Source, settings: Settings) -> Artifact:
+    """Ingest a recording, with cameras found from the person if it has none."""
+    return ingest(store, source, settings.capture, missing_cameras(store, source))
+
+
 def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
     """Return the recording with people detected by a network, if it needs that, and with points of the subject's
     hands, if they are wanted, and the recording has them or the network is installed."""
@@ -37,7 +49,7 @@ def ingest_part(store: Store, source: Source, part: CapturePart, settings: Setti
     """Ingest the recording, or the part of it that a study uses. The limits of these settings apply here and
     afterwards."""
     set_limits(settings.limits)
-    recording = with_detections(store, ingest(store, source, settings.capture), settings)
+    recording = with_detections(store, ingest_recording(store, source, settings), settings)
     parts = part.select(Capture.load(recording.root))
     return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
 

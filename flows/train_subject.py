@@ -11,7 +11,7 @@ from prefect import flow
 from prefect.client.schemas.objects import FlowRun, State
 
 from flows.arguments import StoreFolder
-from flows.preparation import Prepared, segment_and_fit, segment_subject, with_detections
+from flows.preparation import Prepared, missing_cameras, segment_and_fit, segment_subject, with_detections
 from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
@@ -77,15 +77,21 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     artifact_store = Store(store.resolve())
     capture = path_or_url(capture)
     source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
-    recorded = ingest(artifact_store, source, settings.capture)
+    cameras = missing_cameras(artifact_store, source)
+    recorded = ingest(artifact_store, source, settings.capture, cameras)
     normalised = Capture.load(recorded.root)
     held_out_cameras(normalised.train_cameras, normalised.test_cameras, settings.evaluation.holdout)
     subject = normalised.name
     artifact_store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
     link = partial(artifact_store.link_latest, subject)
-    link(recorded)
+    made = (cameras, recorded) if cameras else (recorded,)
+    artifact_store.unlink_latest(subject, {"cameras"} - {one.stage for one in made})
+    for artifact in made:
+        link(artifact)
     recording = with_detections(artifact_store, recorded, settings)
-    artifact_store.unlink_latest(subject, OPTIONAL - {recording.stage})
+    made = (*made, recording)
+    skipped = OPTIONAL - {one.stage for one in made}
+    artifact_store.unlink_latest(subject, skipped)
     link(recording)
     calibration = link(calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
@@ -98,14 +104,14 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
         for camera in left_out
     )
     evaluation = link(evaluate(artifact_store, truth, *prepared, training, settings.evaluation, held_out))
-    results, asset = [recorded, *prepared, training, evaluation], None
+    results, asset = [*made, *prepared[1:], training, evaluation], None
     if reason := reason_without_novel_poses(training.root):
         log.warning("no asset: %s", reason)
     else:
         results.append(export(artifact_store, recording, calibration, segmentation, training, settings.asset))
         asset = results[-1].root / "avatar.usdz"
     # Again: another run of this name may have relinked them.
-    artifact_store.unlink_latest(subject, OPTIONAL - {recording.stage})
+    artifact_store.unlink_latest(subject, skipped)
     for artifact in results:
         link(artifact)
     trained = Trained(artifact_store.subject_folder(subject), evaluation.root / "report.html", asset)

@@ -57,7 +57,7 @@ def import_subject(store: Store, path: Path) -> Manifest:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give an archive of `hnerf store export`")
-    with path.open("rb") as archive, store.scratch(STAGES[0], uuid4().hex) as scratch:
+    with path.open("rb") as archive, store.scratch("capture", uuid4().hex) as scratch:
         manifest = read_contents(Manifest, archive, str(path))
         require_room(manifest.unpacked_bytes(), store.root, str(path))
         _check_subject(manifest, store)

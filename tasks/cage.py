@@ -29,6 +29,7 @@ from hnerf.processes import end_with_parent
 from hnerf.progress import Progress, listening, report
 from tasks.launcher import KILLED, LostWorkerError
 from tasks.limits import current_limits, limit_s
+from tasks.source import Source, require_unchanged
 
 MAX_WRITTEN_BYTES = 1 << 32  # per file: one image, or the keypoints of a camera
 MAX_OPEN_FILES = 1024
@@ -75,6 +76,17 @@ def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> 
         raise RuntimeError(f"{opened}: its reader ended with exit code {reader.returncode}")
     if reader.returncode < 0:
         raise _killed(opened, signal.Signals(-reader.returncode))
+
+
+def read_source(source: Source, read: Callable[..., object], *arguments: object) -> None:
+    """Call `read(*arguments)`, which reads the recording, as `run_caged` does. Raises InputError if the recording has
+    changed since its digest was taken: one that is moved or replaced meanwhile looks damaged."""
+    try:
+        run_caged(read, *arguments, folder=source.root)
+    except (InputError, FileNotFoundError):
+        require_unchanged(source)
+        raise
+    require_unchanged(source)
 
 
 def _pass_on(message: dict[str, Any]) -> None:

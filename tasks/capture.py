@@ -3,25 +3,22 @@
 from pathlib import Path
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.formats.from_person import FromPerson
 from hnerf.capture.ingest import ingest as ingest_folder
 from hnerf.capture.subset import subset
 from hnerf.config import CaptureSettings
-from hnerf.errors import InputError
-from tasks.cage import run_caged
-from tasks.source import Source, require_unchanged
+from tasks.cage import read_source
+from tasks.source import Source
 from tasks.stage import stage
 from tasks.store import Artifact
 
 
 @stage("capture", version="22")
-def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
-    """Read a recording in any supported layout; undistort and normalise it."""
-    try:
-        run_caged(ingest_folder, source.root, settings, out, folder=source.root)
-    except (InputError, FileNotFoundError):
-        require_unchanged(source)  # a recording that is moved or replaced meanwhile looks damaged
-        raise
-    require_unchanged(source)
+def ingest(out: Path, source: Source, settings: CaptureSettings, cameras: Artifact | None = None) -> dict[str, float]:
+    """Read a recording in any supported layout; undistort and normalise it. cameras: those found from the person, if
+    it has no calibration."""
+    layout = FromPerson(source.root, cameras.root) if cameras else None
+    read_source(source, ingest_folder, source.root, settings, out, layout)
     capture = Capture.load(out)
     return {"cameras": len(capture.cameras), "frames": len(capture.frames)}
 

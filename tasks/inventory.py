@@ -132,7 +132,7 @@ def _links(folder: Path) -> Iterator[tuple[str, str]]:
 
 def _recorded_name(artifact: Artifact) -> str:
     """Return the name of the person in a recording; empty for artifacts of other stages."""
-    if artifact.stage != STAGES[0]:
+    if artifact.stage != "capture":
         return ""
     described = artifact.root / "capture.json"
     try:

@@ -45,8 +45,19 @@ SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving", ".shared")  # a
 MAX_RECORD_BYTES = 256_000_000  # a million files need half of this
 ATTEMPTS = 100  # to lock a key in a folder that other processes create and remove
 # In order: each stage is computed from those before it.
-STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
-OPTIONAL = {"detection", "hands"}  # stages that a run may skip
+STAGES = (
+    "cameras",
+    "capture",
+    "detection",
+    "hands",
+    "calibration",
+    "segmentation",
+    "fit",
+    "training",
+    "evaluation",
+    "asset",
+)
+OPTIONAL = {"cameras", "detection", "hands"}  # stages that a run may skip
 
 NAME = re.compile(r"[a-z][a-z-]{0,30}/[0-9a-f]{32}")  # of an artifact
 
@@ -96,7 +107,7 @@ class Store:
 
     def exists(self) -> bool:
         """Return whether anything was ever stored here. A folder without any of these subfolders is not a store."""
-        return any((self.root / name).is_dir() for name in ("subjects", "ingested", STAGES[0]))
+        return any((self.root / name).is_dir() for name in ("subjects", "ingested", "capture"))
 
     def find(self, stage: str, key: str) -> Artifact | None:
         """Return the artifact if it is recorded and intact, else None. From now on, it counts as used by this

@@ -11,11 +11,12 @@ import numpy as np
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, Capture, SubjectPoint
-from hnerf.capture.clocks import InStep, in_step, read_clocks, warn_if_uneven
+from hnerf.capture.clocks import InStep, in_step, warn_if_uneven
 from hnerf.capture.footage import Footage, Video, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
 from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.capture.formats.from_person import FromPerson
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
@@ -75,17 +76,17 @@ BAR_FRAMES = 5  # evenly spaced frames in which black bars are searched for
 log = logging.getLogger("hnerf.capture")
 
 
-def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Uncalibrated | None = None) -> Capture:
-    """Read a capture folder (in any of LAYOUTS), or one video, and write it normalised into `out`.
+def ingest(folder: Path, settings: CaptureSettings, out: Path, layout: Layout | None = None) -> Capture:
+    """Read a capture folder, or one video, and write it normalised into `out`. layout: None to recognise it.
 
     Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. If `capture.toml`
     names no frames, those before the first and after the last detected person are left out. An `uncalibrated` recording
     is read without camera poses and board footage; all its cameras are then for training. Raises InputError, one line
     that names the file, on anything missing, unreadable, contradictory or unsafe.
     """
-    layout = uncalibrated or recognise(folder)
-    lenses = layout.lenses()
-    if not uncalibrated:
+    layout = layout or recognise(folder)
+    lenses, calibrated = layout.lenses(), not isinstance(layout, Uncalibrated)
+    if calibrated:
         _warn_of_unread(folder, ("keypoints",), set(lenses))
     if isinstance(layout, EasyMocap):
         places = BY_CAMERA if isinstance(layout, Videos) else (*BY_CAMERA, "videos")  # a lone video can have any name
@@ -95,9 +96,9 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     subject = capture_name(folder, manifest)
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
     filmed = {name: layout.footage(name) for name in cameras.train + cameras.test}
-    clocks = {} if len(filmed) == 1 else read_clocks(folder)
+    clocks = {} if len(filmed) == 1 else layout.clocks()
     footage = in_step(filmed, clocks, manifest.fps or DEFAULT_FPS)
-    if len(filmed) == 1 and not uncalibrated:
+    if len(filmed) == 1 and calibrated:
         warn_if_uneven(*filmed.values())
     _warn_of_hdr(filmed)
     recorded, fps = _common_frames(footage), _frame_rate(folder, manifest.fps, filmed, footage)
@@ -118,7 +119,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     for file, chosen in ((KEYPOINTS, to_body_25(people, manifest.keypoints)), (GIVEN_HANDS, hands)):
         write_points(out / file, {name: normalisers[name].keypoints(points) for name, points in chosen.items()})
     _write_given_poses(folder, layout, wanted, out)
-    if not uncalibrated and (boards := read_board_footage(folder, "extrinsic")):
+    if calibrated and (boards := read_board_footage(folder, "extrinsic")):
         normalised_corners(boards, normalisers).save(out)
 
     metres = manifest.metres_per_unit
@@ -142,6 +143,15 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     )
     capture.save()
     return capture
+
+
+def lacks_calibration(folder: Path) -> bool:
+    """Return whether a folder holds recordings of several cameras, and neither their calibration nor footage of a board
+    to calibrate them with."""
+    known = any(layout.recognises(folder) for layout in LAYOUTS if layout is not Videos)
+    if known or path_in_capture(folder, "calibration", "extrinsic").exists():
+        return False
+    return folder.is_dir() and len(cameras_without_calibration(folder)) > 1
 
 
 def exported_lenses(folder: Path) -> list[Lens]:
@@ -195,8 +205,12 @@ def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
     is not the vertical axis of the layout's own world.
     """
     manifest = read_manifest(folder)
-    if isinstance(layout, PeopleSnapshot | Videos) and manifest.up != "z":
-        raise InputError(f"{folder / 'capture.toml'}: up: z is up where one camera makes the world; remove the line")
+    if isinstance(layout, PeopleSnapshot | Videos | FromPerson) and manifest.up != "z":
+        raise InputError(f"{folder / 'capture.toml'}: up: z is up where the footage makes the world; remove the line")
+    if isinstance(layout, FromPerson) and manifest.metres_per_unit != 1:
+        raise InputError(
+            f"{folder / 'capture.toml'}: units: cameras found from the person are in metres; remove the line"
+        )
     if not isinstance(layout, Uncalibrated):
         return manifest
     dropped = {"cameras"} | ({"frames"} if layout.only else set())

@@ -1,5 +1,6 @@
 """Recordings without a calibration: where their images and keypoints lie, and what is known of their lenses."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hnerf.capture.clocks import Clock
 from hnerf.capture.footage import Footage
 from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.formats.layout import Layout, StoredFrame
@@ -55,12 +57,13 @@ class Uncalibrated(Layout):
     """A recording whose camera poses are unknown: all cameras are at the origin.
 
     lens_file: intrinsics, in `intri.yml` or in a TOML of cameras; fov_deg: field of view of all other cameras, across
-    the longer side; only: the one camera to read, else all.
+    the longer side; only: the one camera to read, else all; found_clocks: used instead of those in the folder.
     """
 
     lens_file: Path | None = None
     fov_deg: float | None = None
     only: str | None = None
+    found_clocks: Mapping[str, Clock] | None = None
 
     @cached_property
     def known_lenses(self) -> dict[str, KnownLens]:
@@ -77,12 +80,18 @@ class Uncalibrated(Layout):
         known = {name: KnownLens(lens, f"from {file.name}") for name, lens in given.items() if file and name in names}
         others = [name for name in names if name not in known]
         if self.fov_deg and not others:
-            raise InputError(f"{file}: has the lenses of all cameras, and --fov is for others; leave out one")
+            raise InputError(
+                f"{file}: has the lenses of all cameras; leave out --fov or field_of_view_deg, or the file"
+            )
         return known | {name: lens_by_angle(name, self.footage(name), self.fov_deg) for name in others}
 
     def lenses(self) -> dict[str, Lens]:
         """Return the lens of every camera, at the origin."""
         return {name: known.lens for name, known in self.known_lenses.items()}
+
+    def clocks(self) -> dict[str, Clock]:
+        """Return the clocks found, else those in the folder; empty if there are none."""
+        return super().clocks() if self.found_clocks is None else dict(self.found_clocks)
 
     def footage(self, camera: str) -> Footage:
         """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""

@@ -11,7 +11,8 @@ from PIL import Image
 from hnerf.capture.capture import SubjectPoint, write_image
 from hnerf.capture.footage import Video
 from hnerf.capture.formats import easymocap
-from hnerf.capture.ingest import ingest, recognise
+from hnerf.capture.formats.from_person import FromPerson
+from hnerf.capture.ingest import ingest, lacks_calibration, recognise
 from hnerf.capture.lens import Lens
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.capture.video_metadata import KEY, MAX_METADATA_BYTES, focal_35mm
@@ -191,3 +192,26 @@ def test_board_footage_is_not_read_without_calibration(tmp_path: Path) -> None:
     (folder / "capture.toml").write_text("[board]\ncolumns = 4\nrows = 5\nsquare_m = 0.05\n")
     capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder, only="02"))
     assert not (capture.root / "boards.npz").exists()
+
+
+def test_which_folders_lack_a_calibration(tmp_path: Path) -> None:
+    """Several cameras without calibration do; one video, other layouts, and cameras that a board shows do not."""
+    for name in ("one", "two", "boards"):
+        write_video(tmp_path / name / "a.mp4", 2)
+    for name in ("two", "boards"):
+        write_video(tmp_path / name / "b.mp4", 2)
+    write_images(tmp_path / "images", "a")
+    write_images(tmp_path / "images", "b")
+    (tmp_path / "boards" / "calibration" / "extrinsic").mkdir(parents=True)
+    write_easymocap(tmp_path / "calibrated")
+    assert {path.name for path in tmp_path.iterdir() if lacks_calibration(path)} == {"two", "images"}
+    assert not lacks_calibration(tmp_path / "one" / "a.mp4")
+
+
+@pytest.mark.parametrize("line", ['up = "y"', 'units = "mm"'])
+def test_the_world_of_cameras_found_from_the_person_is_not_stated(tmp_path: Path, line: str) -> None:
+    folder = write_easymocap(tmp_path / "film")
+    easymocap.write_easymocap(folder, list(easymocap.EasyMocap(folder).lenses().values()))
+    (folder / "capture.toml").write_text(line)
+    with pytest.raises(InputError, match=r"capture\.toml: (up|units): .*; remove the line"):
+        ingest(folder, CaptureSettings(), tmp_path / "out", FromPerson(folder, folder))

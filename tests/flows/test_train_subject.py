@@ -35,7 +35,18 @@ thread = threading.Thread(target=load)
 thread.start()
 thread.join()
 """
-STAGES = ("ingest", "detect", "find_hands", "calibrate", "segment", "fit", "train", "evaluate", "export")
+STAGES = (
+    "find_cameras",
+    "ingest",
+    "detect",
+    "find_hands",
+    "calibrate",
+    "segment",
+    "fit",
+    "train",
+    "evaluate",
+    "export",
+)
 
 
 @pytest.fixture
@@ -51,6 +62,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return {}
 
     replace_stages(monkeypatch, STAGES, write)
+    monkeypatch.setattr(preparation, "lacks_calibration", lambda path: (path / "uncalibrated").exists())
     monkeypatch.setattr(preparation, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
     monkeypatch.setattr(preparation, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
     monkeypatch.setattr(preparation, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
@@ -141,6 +153,16 @@ def test_later_stages_get_the_detections_in_place_of_the_recording(
     assert given(subject, "calibration") == [stage]
     assert given(subject, "training") == [stage, "calibration", "segmentation", "fit"]
     assert given(subject, "asset") == [stage, "calibration", "segmentation", "training"]
+
+
+def test_cameras_found_from_the_person_are_linked_until_the_folder_has_its_own(folder: Path, tmp_path: Path) -> None:
+    (folder / "uncalibrated").touch()
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
+    assert given(subject, "cameras") == [] and given(subject, "capture") == ["cameras"]
+    assert (subject / "asset").exists()
+    (folder / "uncalibrated").unlink()
+    assert train_subject.fn(folder, "demo", tmp_path / "store", []).subject == subject
+    assert given(subject, "capture") == [] and not (subject / "cameras").is_symlink()
 
 
 def test_a_keypoint_network_of_the_users_own_counts_by_its_bytes(folder: Path, tmp_path: Path) -> None:

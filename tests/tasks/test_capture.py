@@ -7,8 +7,9 @@ import pytest
 
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
-from tasks import capture as module
+from tasks import cage
 from tasks.cage import run_caged
+from tasks.capture import ingest
 from tasks.source import read_capture
 from tasks.store import Store
 from tests.capture.recordings import write_easymocap
@@ -25,7 +26,7 @@ def test_a_recording_that_changes_while_it_is_read_is_not_stored(
 
     store = Store(tmp_path / "store")
     source, _ = read_capture(write_easymocap(tmp_path / "folder"))
-    monkeypatch.setattr(module, "run_caged", changing)
+    monkeypatch.setattr(cage, "run_caged", changing)
     with pytest.raises(InputError, match="folder: changed or moved since the command started"):
-        module.ingest(store, source, CaptureSettings())
+        ingest(store, source, CaptureSettings())
     assert not store.root.exists()

@@ -2,9 +2,11 @@
 
 import dataclasses
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
+from hnerf.capture.clocks import Clock
 from hnerf.capture.ingest import ingest
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
@@ -13,17 +15,21 @@ from hnerf.errors import InputError
 
 
 def calibrate_recording(
-    folder: Path, height_m: float | None = None, lens_file: Path | None = None, fov_deg: float | None = None
+    folder: Path,
+    height_m: float | None = None,
+    lens_file: Path | None = None,
+    fov_deg: float | None = None,
+    clocks: Mapping[str, Clock] | None = None,
 ) -> PersonCalibration:
     """Calibrate the cameras of a recording from its own keypoints, or from the network's if it has none.
 
     An existing calibration of the folder is not read, except for intrinsics in its `intri.yml` that no earlier
-    calibration from the person estimated. Raises InputError if the recording cannot be read or does not determine the
-    cameras.
+    calibration from the person estimated. clocks: used instead of those in the folder. Raises InputError if the
+    recording cannot be read or does not determine the cameras.
     """
     if not cameras_without_calibration(folder):
         raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to calibrate from; add the recordings")
-    layout = Uncalibrated(folder, lens_file, fov_deg)
+    layout = Uncalibrated(folder, lens_file, fov_deg, found_clocks=clocks)
     with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
         capture = ingest(folder, CaptureSettings(), Path(scratch) / "capture", layout)
         capture = with_keypoints(capture, Path(scratch) / "detected")

@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from hnerf.capture.clocks import Clock, read_clocks
 from hnerf.capture.footage import Footage
 from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.lens import Lens
@@ -53,6 +54,10 @@ class Layout(ABC):
     @abstractmethod
     def footage(self, camera: str) -> Footage:
         """Return a camera's images. Raises InputError if there are none."""
+
+    def clocks(self) -> dict[str, Clock]:
+        """Return the cameras' clocks; empty if they are in step. Raises InputError on a bad value."""
+        return read_clocks(self.folder)
 
     def training_cameras(self) -> list[str]:
         """Return the cameras that the recording's own publication trains on, the rest being for testing; an empty list
