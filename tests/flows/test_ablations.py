@@ -58,7 +58,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
 
     for name in ("calibrate", "segment_subject", "fit"):
         monkeypatch.setattr(preparation, name, lambda *_: None)
-    monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
+    monkeypatch.setattr(preparation, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
     monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
     monkeypatch.setattr(
         module, "read_capture", lambda folder, _: (SimpleNamespace(root=folder, digest=str(folder)), None)

@@ -77,8 +77,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
     for name in ("calibrate", "segment_subject"):
         monkeypatch.setattr(preparation, name, lambda *_: None)
     monkeypatch.setattr(preparation, "fit", lambda *_: "body")
-    for place in (preparation, module):
-        monkeypatch.setattr(place, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
+    monkeypatch.setattr(preparation, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
     monkeypatch.setattr(preparation, "with_detections", lambda store, recording, settings: recording)
     monkeypatch.setattr(preparation, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
     truth = SimpleNamespace(root=tmp_path)
@@ -186,7 +185,7 @@ def test_the_recording_is_read_within_the_limits_of_the_preset(
     (tmp_path / "large.yaml").write_text("based_on: fast\nlimits: {reader_gib: 64}")
     text = f"title: t\nmethods: [{tmp_path / 'large.yaml'}]\nvariants: {{one: {{}}}}"
     (tmp_path / "mine.yaml").write_text(text)
-    monkeypatch.setattr(module, "ingest", lambda *_: pytest.fail(f"{current_limits().reader_gib:g} GiB"))
+    monkeypatch.setattr(preparation, "ingest", lambda *_: pytest.fail(f"{current_limits().reader_gib:g} GiB"))
     with pytest.raises(pytest.fail.Exception, match=r"^64 GiB"):
         benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store")
 
