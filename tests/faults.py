@@ -255,7 +255,7 @@ FAULTS = (
           "radius + 0 * (x + y[:, None])", "training/pixels"),
     # body fit
     Fault("ground-offsets", "body/ground", " + pose.offsets_m[:, 2]", ""),
-    Fault("ground-one-foot", "body/ground", "for foot in (LEFT, RIGHT)", "for foot in (LEFT, LEFT)"),
+    Fault("ground-one-foot", "body/ground", "(LEFT_FOOT, RIGHT_FOOT)", "(LEFT_FOOT, LEFT_FOOT)"),
     Fault("ground-never-each-foot", "body/fit", "replace(problem.ground, each_foot=True)", "problem.ground"),
     Fault("standing-feet-not-held", "body/fit", "standing_feet=StandingFeet.of_pose(pose, runs(capture), capture.fps)",
           "standing_feet=None", "body/standing_feet"),

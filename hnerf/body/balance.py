@@ -10,17 +10,18 @@ import torch
 from torch import Tensor
 
 from hnerf.body.normal_equations import NormalEquations, geman_mcclure
+from hnerf.capture.body_25 import Body25
 
 BALANCE_M = 0.05  # standard deviation
 OUTLIER_M = 0.15  # distance in a step or a jump, where the prior lets go
 
 # Shares of the body's mass (Winter 2009, table 4.1) by BODY_25 keypoint: half of a segment's share at either end, all
 # of an arm's at its elbow.
-TRUNK = {1: 0.289, 8: 0.289}  # head and trunk: neck and middle of the hips
-ARMS = {3: 0.05, 6: 0.05}  # elbows
-THIGHS = {9: 0.05, 12: 0.05, 10: 0.05, 13: 0.05}  # hips and knees
-SHANKS = {10: 0.0305, 13: 0.0305, 11: 0.0305, 14: 0.0305}  # knees and ankles, with the feet
-SUPPORT = {11: 0.5, 14: 0.5}  # ankles: judged by keypoints, the trunk stands above them
+TRUNK = {Body25.NECK: 0.289, Body25.MID_HIP: 0.289}  # with the head
+ARMS = {Body25.R_ELBOW: 0.05, Body25.L_ELBOW: 0.05}
+THIGHS = {Body25.R_HIP: 0.05, Body25.L_HIP: 0.05, Body25.R_KNEE: 0.05, Body25.L_KNEE: 0.05}
+SHANKS = {Body25.R_KNEE: 0.0305, Body25.L_KNEE: 0.0305, Body25.R_ANKLE: 0.0305, Body25.L_ANKLE: 0.0305}  # with feet
+SUPPORT = {Body25.R_ANKLE: 0.5, Body25.L_ANKLE: 0.5}  # judged by keypoints, the trunk stands above them
 
 
 def centre_of_mass_over_feet() -> Tensor:

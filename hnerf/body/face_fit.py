@@ -16,6 +16,7 @@ from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.reprojection import project
 from hnerf.body.rig import Rig, pose_vertices, vertex_skinning
+from hnerf.capture.body_25 import EARS, Body25
 from hnerf.capture.capture import Capture
 from hnerf.detection.faces import POINTS, SIZE, FaceNetwork
 from hnerf.detection.region import Region, upright_angle
@@ -27,7 +28,6 @@ from hnerf.warp_import import wp
 
 log = logging.getLogger("hnerf.fit")
 
-RIGHT_EYE, LEFT_EYE, EARS = 15, 16, [17, 18]  # of BODY_25
 TOWARDS_EARS, BELOW_M, SIDE_M = 0.3, 0.035, 0.3  # a head's region: its middle from the eyes, and its side
 MOST_VIEWS = 24  # photographs looked at, evenly spaced
 FACING = 0.5  # least cosine between where the face looks and the direction to the camera
@@ -103,8 +103,8 @@ def photographs_of_face(capture: Capture, fit: BodyFit) -> list[Photograph]:
 def face_axes(keypoints_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle of a head's region (3,), and unit vectors to the face's left, ahead and up (3, 3), from BODY_25
     keypoints (25, 3)."""
-    eyes_m, ears_m = keypoints_m[[RIGHT_EYE, LEFT_EYE]].mean(0), keypoints_m[EARS].mean(0)
-    left = keypoints_m[LEFT_EYE] - keypoints_m[RIGHT_EYE]
+    eyes_m, ears_m = keypoints_m[[Body25.R_EYE, Body25.L_EYE]].mean(0), keypoints_m[list(EARS)].mean(0)
+    left = keypoints_m[Body25.L_EYE] - keypoints_m[Body25.R_EYE]
     left = left / np.linalg.norm(left)
     ahead = eyes_m - ears_m - (eyes_m - ears_m) @ left * left
     ahead = ahead / np.linalg.norm(ahead)

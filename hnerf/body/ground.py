@@ -12,11 +12,11 @@ from torch import Tensor
 
 from hnerf.body.articulation import Pose
 from hnerf.body.normal_equations import NormalEquations, geman_mcclure
+from hnerf.capture.body_25 import LEFT_FOOT, RIGHT_FOOT, Body25
 from hnerf.capture.standing import is_standing, stature_on_ground_m
 from hnerf.geometry.camera import Camera
 
-LEFT, RIGHT = [19, 20, 21], [22, 23, 24]  # toes and heel of a foot in BODY_25
-FEET = LEFT + RIGHT
+FEET: tuple[Body25, ...] = LEFT_FOOT + RIGHT_FOOT
 GROUND_STD_M = 0.02  # of a keypoint of the lower foot above the ground, beyond its height on the rest body
 OUTLIER_M = 0.25  # height of a body in the air
 EACH_STD_M, EACH_OUTLIER_M = 0.04, 0.05  # the same for each foot, and height of one that swings
@@ -56,7 +56,7 @@ class Ground:
         height_m = keypoints_m @ up - (rest_m - pose.rig.vertices_m[:, 2].min())
         rows, cost = torch.arange(len(height_m)), 0.0
         parts = [(FEET, GROUND_STD_M, OUTLIER_M)]
-        parts += [(foot, EACH_STD_M, EACH_OUTLIER_M) for foot in (LEFT, RIGHT)] if self.each_foot else []
+        parts += [(foot, EACH_STD_M, EACH_OUTLIER_M) for foot in (LEFT_FOOT, RIGHT_FOOT)] if self.each_foot else []
         for points, std_m, outlier_m in parts:
             lowest, at = height_m[:, points].min(1)
             weight, costs = geman_mcclure(lowest.square(), std_m, outlier_m)

@@ -3,10 +3,12 @@
 import cv2
 import numpy as np
 
+from hnerf.capture.body_25 import Body25
 from hnerf.geometry.camera import Camera
 
-TORSO = (2, 5, 9, 12)  # shoulders and hips in BODY_25
-HEAD_AND_TORSO = (0, 1, 2, 5, 8, 9, 12, 15, 16, 17, 18)
+TORSO = (Body25.R_SHOULDER, Body25.L_SHOULDER, Body25.R_HIP, Body25.L_HIP)
+HEAD = (Body25.NOSE, Body25.NECK, Body25.R_EYE, Body25.L_EYE, Body25.R_EAR, Body25.L_EAR)
+HEAD_AND_TORSO = tuple(sorted((*HEAD, *TORSO, Body25.MID_HIP)))
 OUTLIER_ERROR_RATIO = 3.0  # of the error with a keypoint to that without it; 1.2 by chance
 MIN_BOX_PX = 4.0  # larger side of the box around keypoints; in a smaller one they are all on one spot
 MIN_WIDTH_M = 0.05  # root mean square distance of points from a line that determines the rotation about it

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hnerf.body.normal_equations import NormalEquations, geman_mcclure
 from hnerf.body.observations import Observations
+from hnerf.capture.body_25 import LEFT_ARM, LEFT_LEG, RIGHT_ARM, RIGHT_LEG, Body25
 from hnerf.capture.capture import Capture
 from hnerf.capture.keypoint_sets import SETS
 from hnerf.detection.merge import nearest_person
@@ -17,7 +18,10 @@ from hnerf.detection.merge import nearest_person
 DEPTH_STD_M, OUTLIER_M = 0.1, 0.3
 
 # Limbs from the trunk, hips, shoulders. The trunk is left out: the network sees it lean back by a decimetre.
-LIMBS = ((2, 3), (3, 4), (5, 6), (6, 7), (9, 10), (10, 11), (12, 13), (13, 14), (9, 12), (2, 5))
+LIMBS = (
+    *RIGHT_ARM, *LEFT_ARM, *RIGHT_LEG, *LEFT_LEG,
+    (Body25.R_HIP, Body25.L_HIP), (Body25.R_SHOULDER, Body25.L_SHOULDER),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

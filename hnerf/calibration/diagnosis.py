@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
+from hnerf.capture.body_25 import Body25
 from hnerf.capture.people import person_heights_px
 from hnerf.geometry.camera import Camera, resampling
 from hnerf.geometry.triangulation import confidence_of, reprojection_px, solve_points, triangulate
@@ -20,8 +21,13 @@ MISFIT_SHARE_OF_THREE = 0.6  # of three cameras: the two that are left agree mor
 
 MIN_CROSSING_DEG = 10.0  # between lines of sight, below which a point's depth is uncertain
 
-# BODY_25: ankle-knee, knee-hip, hips-neck and neck-nose make 0.87 of an adult's stature (Winter 2009, figure 4.1).
-LIMB_CHAIN = (((11, 10), (14, 13)), ((10, 9), (13, 12)), ((8, 1),), ((1, 0),))
+# Ankle-knee, knee-hip, hips-neck and neck-nose make 0.87 of an adult's stature (Winter 2009, figure 4.1).
+LIMB_CHAIN = (
+    ((Body25.R_ANKLE, Body25.R_KNEE), (Body25.L_ANKLE, Body25.L_KNEE)),
+    ((Body25.R_KNEE, Body25.R_HIP), (Body25.L_KNEE, Body25.L_HIP)),
+    ((Body25.MID_HIP, Body25.NECK),),
+    ((Body25.NECK, Body25.NOSE),),
+)
 CHAIN_SHARE_OF_STATURE = 0.87
 
 MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # for each mistake, the function that undoes it

@@ -5,6 +5,7 @@ import logging
 import numpy as np
 
 from hnerf.calibration.diagnosis import GROSS_SHARE, crossed_points
+from hnerf.capture.body_25 import EARS, Body25
 from hnerf.capture.capture import Capture
 from hnerf.capture.people import person_heights_px
 from hnerf.errors import InputError
@@ -22,10 +23,8 @@ GAIN = 0.25  # share of keypoints that undoing a mistake brings onto the person
 LOW_SHARE = 0.4  # of the other cameras' share; a mask of a half-hidden person still holds more keypoints than that
 MAX_COVERED = 0.5  # of an image, by a person's mask; a larger mask is usually inverted, which segmentation refuses
 MIN_IN_SIGHT = 0.05  # share of the person's keypoints within the images of a test camera
-# BODY_25
-NOSE, NECK, MID_HIP, EARS = 0, 1, 8, (17, 18)
-LEFT, RIGHT = (5, 12), (2, 9)  # shoulder, hip
-TOES, HEELS = (19, 22), (21, 24)
+LEFT, RIGHT = (Body25.L_SHOULDER, Body25.L_HIP), (Body25.R_SHOULDER, Body25.R_HIP)
+TOES, HEELS = (Body25.L_BIG_TOE, Body25.R_BIG_TOE), (Body25.L_HEEL, Body25.R_HEEL)
 
 
 def check_spread(capture: Capture, keypoints: np.ndarray) -> None:
@@ -54,7 +53,7 @@ def doubts(capture: Capture, keypoints: np.ndarray, points_m: np.ndarray | None)
 
 def _not_upright(points_m: np.ndarray, up: str) -> list[str]:
     """Return a doubt if the trunk, from mid-hip to neck, does not point along the world's `up`."""
-    trunk = _direction(points_m[:, MID_HIP], points_m[:, NECK])
+    trunk = _direction(points_m[:, Body25.MID_HIP], points_m[:, Body25.NECK])
     trunk = trunk[np.isfinite(trunk).all(1)]
     if not len(trunk):
         return []
@@ -75,10 +74,10 @@ def exchanged_sides(points_m: np.ndarray) -> list[str]:
     Face and feet show which way is forward whatever the labels are: from the ears' middle to the nose, and from heels
     to toes. Left is up x forward, with up from mid-hip to neck.
     """
-    forward = _direction(points_m[:, EARS].mean(1), points_m[:, NOSE])
+    forward = _direction(points_m[:, EARS].mean(1), points_m[:, Body25.NOSE])
     feet = _direction(points_m[:, HEELS].mean(1), points_m[:, TOES].mean(1))
     forward = np.nan_to_num(forward) + np.nan_to_num(feet)
-    up = _direction(points_m[:, MID_HIP], points_m[:, NECK])
+    up = _direction(points_m[:, Body25.MID_HIP], points_m[:, Body25.NECK])
     left = np.cross(up, forward)
     labelled = _direction(points_m[:, RIGHT].mean(1), points_m[:, LEFT].mean(1))
     cosine = (labelled * left).sum(1) / np.linalg.norm(left, axis=1).clip(1e-9)

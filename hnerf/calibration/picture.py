@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hnerf.calibration.diagnosis import Measure
-from hnerf.capture.keypoint_sets import FEET, LIMBS
+from hnerf.capture.body_25 import FEET, LIMBS
 from hnerf.geometry.camera import Camera
 
 SHOWN_FRAMES = 5

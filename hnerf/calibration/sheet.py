@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.evidence import NO_MATCHES, Evidence
 from hnerf.calibration.silhouettes import MaskOutline
-from hnerf.capture.keypoint_sets import FEET, LIMBS
+from hnerf.capture.body_25 import FEET, LIMBS
 from hnerf.geometry.camera import Camera
 
 SCALE_PX = Normalize(0, 10)  # range of residuals, from green to red

@@ -14,9 +14,6 @@ from hnerf.errors import InputError
 # Points of the left hand, then of the right: the wrist, then four of each finger, from the thumb on. Every array of
 # more points ends with them: the two whole-body sets, and others to whose points a file adds hands.
 HAND_POINTS = 42
-LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13), (13, 14),
-         (1, 8), (0, 1))  # fmt: skip
-FEET = ((11, 24), (11, 22), (14, 21), (14, 19))
 
 KeypointSetName = Literal[
     "coco_17", "coco_18", "body_25", "body_25b", "halpe_26", "coco_wholebody", "halpe_136", "blazepose_33"

@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from hnerf.capture.body_25 import ANKLES, Body25
 from hnerf.geometry.camera import Camera
 
 STANDING_M = (1.2, 2.1)
 NEAR_STATURE = (0.85, 1.2)  # the same, relative to a known stature
-NOSE, SOLES, ANKLES = 0, (19, 21, 22, 24), (11, 14)  # of BODY_25; soles: big toes and heels
+SOLES = (Body25.L_BIG_TOE, Body25.L_HEEL, Body25.R_BIG_TOE, Body25.R_HEEL)
 NOSE_SHARE, ANKLE_SHARE = 0.92, 0.039  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.936)
 
 
@@ -34,11 +35,11 @@ def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float
         far_m = -origin[vertical] / soles[..., vertical]
     far_m = np.where((far_m > 0) & (keypoints[:, feet, 2] > 0), far_m, np.inf)
     nearest = far_m.argmin(1)
-    frames = np.flatnonzero(np.isfinite(far_m.min(1)) & (keypoints[:, NOSE, 2] > 0))
+    frames = np.flatnonzero(np.isfinite(far_m.min(1)) & (keypoints[:, Body25.NOSE, 2] > 0))
     if len(frames) == 0:
         return float("nan")
     foot_m = origin + far_m[frames, nearest[frames], None] * soles[frames, nearest[frames]]
-    _, noses = camera.rays(keypoints[frames, NOSE, :2])
+    _, noses = camera.rays(keypoints[frames, Body25.NOSE, :2])
     level = [axis for axis in range(3) if axis != vertical]
     away_m = foot_m - origin
     along_m = (away_m[:, level] * noses[:, level]).sum(1) / (noses[:, level] ** 2).sum(1)

@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from hnerf.capture.body_25 import Body25
 from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.lens import distort_points
 from hnerf.capture.people import PersonTrack, follow_in_each_camera, follow_people, moves
@@ -11,7 +12,7 @@ from hnerf.geometry.camera import resampling
 from hnerf.geometry.triangulation import triangulate
 
 EQUAL_CLAIM = 0.9  # share of the best claim above which another person could equally be meant
-MIDDLE = (1, 8)  # neck and mid-hip: where a person stands
+MIDDLE = (Body25.NECK, Body25.MID_HIP)  # where a person stands
 
 
 def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:

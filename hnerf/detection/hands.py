@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hnerf.capture.body_25 import LEFT_ARM, RIGHT_ARM
 from hnerf.capture.capture import HANDS, Capture
 from hnerf.capture.people import person_heights_px
 from hnerf.capture.subject import subject_keypoints
@@ -22,7 +23,7 @@ from hnerf.progress import tracked
 from hnerf.side_by_side import side_by_side
 
 SIZE, POINTS = 224, 21
-SIDES = ((6, 7), (3, 4))  # elbow and wrist of the left and of the right arm in BODY_25
+SIDES = (LEFT_ARM[1], RIGHT_ARM[1])  # elbow and wrist
 REACH, SIDE = 0.45, 1.2  # distance from wrist to middle of the hand, and side of the region, in forearm lengths
 SHORTEST = 0.1  # forearm length in heights of the person: a forearm that points at the camera looks shorter
 PASSES = 2  # the second searches where the first found the hand

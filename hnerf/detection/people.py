@@ -6,8 +6,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hnerf.capture.body_25 import FEET, LIMBS
 from hnerf.capture.capture import PERSON, Capture, write_image
-from hnerf.capture.keypoint_sets import FEET, LIMBS
 from hnerf.capture.people import PersonTrack, person_heights_px
 from hnerf.detection.merge import nearest_person
 from hnerf.detection.region import Region

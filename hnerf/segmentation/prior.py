@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from hnerf.body.fit_result import BodyFit
+from hnerf.capture.body_25 import FEET, LEFT_FOOT, LEFT_LEG, LIMBS, RIGHT_FOOT, RIGHT_LEG, Body25
 from hnerf.capture.capture import Capture
-from hnerf.capture.keypoint_sets import FEET, LIMBS
 from hnerf.capture.people import person_heights_px
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.timing import median_step
@@ -18,8 +18,9 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
 from hnerf.geometry.triangulation import triangulate
 
-TRUNK = (2, 5, 12, 9)
-THICK = ((1, 8), (9, 10), (12, 13))  # drawn twice as thick as other limbs: the trunk, for side views, and thighs
+TRUNK = (Body25.R_SHOULDER, Body25.L_SHOULDER, Body25.L_HIP, Body25.R_HIP)
+# Drawn twice as thick as other limbs: the trunk, for side views, and thighs
+THICK = ((Body25.NECK, Body25.MID_HIP), RIGHT_LEG[0], LEFT_LEG[0])
 CORE_SHARE = 0.02  # of the person's height: half the width of a limb that is surely body
 MARGIN_PX = 12  # of background around the person
 NEAR_SHARE = 0.03  # of the person's height: error of a body fitted to keypoints alone
@@ -28,9 +29,12 @@ UPRIGHT = 0.7  # minimum cosine between the image's and the world's vertical in 
 HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
 LIKELY, SURE = 0.5, 0.9  # probabilities of a network above which a pixel is likely, or surely, the person's
 FAR = 5  # in longer sides of the image, beyond which nothing is drawn
-FACE = (15, 16, 17, 18)
-SHOULDERS, HIP_WIDTH = (2, 5), 0.8  # of the shoulders' width, for unseen hips
-LEGS = ((9, 10, 11, (22, 23, 24)), (12, 13, 14, (19, 20, 21)))  # hip, knee, ankle, foot
+FACE = (Body25.R_EYE, Body25.L_EYE, Body25.R_EAR, Body25.L_EAR)
+SHOULDERS, HIP_WIDTH = (Body25.R_SHOULDER, Body25.L_SHOULDER), 0.8  # of the shoulders' width, for unseen hips
+LEGS = (
+    (Body25.R_HIP, Body25.R_KNEE, Body25.R_ANKLE, RIGHT_FOOT),
+    (Body25.L_HIP, Body25.L_KNEE, Body25.L_ANKLE, LEFT_FOOT),
+)
 NOSE_ABOVE_NECK, THIGH = 0.45, 0.8  # of the distance from neck to mid-hip, to place unseen joints
 FOOT_SHARE = 0.1  # of the person's height: extent of an unseen foot around its ankle
 
@@ -189,7 +193,7 @@ def _interpolated(tracks: np.ndarray, frames: Sequence[int]) -> np.ndarray:
     """Return tracks (frames, 25, D) with NaN gaps filled linearly in time, by the frames' numbers: the mid-hip's
     absolute position, all others' relative to it."""
     at = (np.array(frames) - frames[0]) / median_step(frames)
-    hip = _filled(tracks[:, 8:9], at)
+    hip = _filled(tracks[:, [Body25.MID_HIP]], at)
     origin = hip if np.isfinite(hip).all() else np.zeros_like(hip)
     return origin + _filled(tracks - origin, at)
 
@@ -215,13 +219,15 @@ def _completed_pose(pose_px: np.ndarray) -> np.ndarray:
 
     face = [k for k in FACE if np.isfinite(pose_px[k]).all()]
     if face:
-        fill(0, pose_px[face].mean(0))
-    fill(8, pose_px[1] + (pose_px[1] - completed[0]) / NOSE_ABOVE_NECK)
-    trunk_px = completed[8] - pose_px[1]
-    fill(0, pose_px[1] - NOSE_ABOVE_NECK * trunk_px)
+        fill(Body25.NOSE, pose_px[face].mean(0))
+    neck_px = pose_px[Body25.NECK]
+    fill(Body25.MID_HIP, neck_px + (neck_px - completed[Body25.NOSE]) / NOSE_ABOVE_NECK)
+    middle_px = completed[Body25.MID_HIP]
+    trunk_px = middle_px - neck_px
+    fill(Body25.NOSE, neck_px - NOSE_ABOVE_NECK * trunk_px)
     for shoulder, (hip, knee, ankle, _) in zip(SHOULDERS, LEGS, strict=True):
-        fill(hip, completed[8] + HIP_WIDTH * (pose_px[shoulder] - pose_px[1]))
-        fill(hip, completed[8])
+        fill(hip, middle_px + HIP_WIDTH * (pose_px[shoulder] - neck_px))
+        fill(hip, middle_px)
         fill(knee, completed[hip] + THIGH * trunk_px)
         fill(ankle, 2 * completed[knee] - completed[hip])
     return completed
@@ -271,10 +277,11 @@ def _drawn(camera: Camera, pose_px: np.ndarray, height_px: float) -> tuple[np.nd
 
     if seen[list(TRUNK)].all():
         cv2.fillConvexPoly(image, cv2.convexHull(np.array([_pixel(pose_px[k]) for k in TRUNK])), 1)
-    if seen[0] and seen[1]:
-        up_px = pose_px[0] - pose_px[1]
+    if seen[Body25.NOSE] and seen[Body25.NECK]:
+        nose_px = pose_px[Body25.NOSE]
+        up_px = nose_px - pose_px[Body25.NECK]
         radius_px = round(HEAD_SHARE * float(np.linalg.norm(up_px)) + CORE_SHARE * height_px)
-        cv2.circle(image, _pixel(pose_px[0] + 0.15 * up_px), radius_px, 1, cv2.FILLED)
+        cv2.circle(image, _pixel(nose_px + 0.15 * up_px), radius_px, 1, cv2.FILLED)
     draw(THICK, times=2)
     return draw(LIMBS), draw(FEET)
 

@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from hnerf.capture.body_25 import Body25
+
 ROOM_HALF_SIDE_M = 4.2
 ROOM_HEIGHT_M = 3.2
-FACE = (15, 16, 0)  # BODY_25: right eye, left eye, nose
+FACE = (Body25.R_EYE, Body25.L_EYE, Body25.NOSE)
 
 
 def person_colour(face_m: np.ndarray, rest_m: np.ndarray, depths_m: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from hnerf.body.anny import anny_rig
 from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 from hnerf.body.skeletons import EQUIVALENTS, exported_name
+from hnerf.capture.body_25 import Body25
 from hnerf.capture.capture import to_8_bit, write_image
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.keypoint_files import write_openpose
@@ -44,11 +45,7 @@ WAVING_AFTER_S = 0.3  # from the first novel pose until the arm is up
 LIMBS = ("upperarm01", "lowerarm01", "wrist", "upperleg01", "lowerleg01", "foot")
 SHARED_JOINTS = ("root", "neck01", "head", *(f"{limb}.{side}" for side in "LR" for limb in LIMBS))
 MIXAMO = {joint: EQUIVALENTS[exported_name(joint)].mixamo for joint in SHARED_JOINTS}
-BODY_25_NAMES = (
-    "Nose", "Neck", "RShoulder", "RElbow", "RWrist", "LShoulder", "LElbow", "LWrist", "MidHip", "RHip", "RKnee",
-    "RAnkle", "LHip", "LKnee", "LAnkle", "REye", "LEye", "REar", "LEar", "LBigToe", "LSmallToe", "LHeel", "RBigToe",
-    "RSmallToe", "RHeel",
-)  # fmt: skip
+BODY_25_NAMES = tuple(point.name.title().replace("_", "") for point in Body25)  # RBigToe
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hnerf.calibration.diagnosis import body_height_m
+from hnerf.capture.body_25 import ANKLES, LEFT_FOOT, RIGHT_FOOT, Body25
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MEAN_STATURE_M, STATURE_SD_M = 1.65, 0.09  # of adults: NCD-RisC 2016 has means of 1.71 (men) and 1.59 m (women)
 CHAIN_SD = 0.03  # relative error of a stature from limb lengths, due to how a detector defines joints
-ANKLES, NECK = (11, 14), 1  # BODY_25
-FEET = ((11, 22, 23, 24), (14, 19, 20, 21))  # ankle, toes and heel of the right and of the left foot
+FEET = ((Body25.R_ANKLE, *RIGHT_FOOT), (Body25.L_ANKLE, *LEFT_FOOT))
 LEAN_SD = np.tan(np.deg2rad(6.0))  # of the mean direction from ankles to neck: people lean as they walk and reach
 ROLL_SD = np.deg2rad(3.0)  # of a camera about its line of sight: people hold and mount cameras level, or on edge
 CONTACT_SD_M = 0.02  # of a standing foot's lowest keypoint above the ground
@@ -95,7 +95,7 @@ def _upright(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) ->
 
 def _body_direction(points_m: np.ndarray) -> np.ndarray:
     """Return the median direction (3,), of length 1, from the ankles to the neck."""
-    body_m = points_m[:, NECK] - points_m[:, ANKLES].mean(1)
+    body_m = points_m[:, Body25.NECK] - points_m[:, ANKLES].mean(1)
     body_m = body_m[np.isfinite(body_m).all(-1)]
     if not len(body_m):
         raise InputError(

@@ -15,6 +15,7 @@ import numpy as np
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.board_footage import BOARDS_FILE
+from hnerf.capture.body_25 import Body25
 from hnerf.capture.capture import PERSON, Capture, write_image
 from hnerf.capture.subset import copy_files, write_arrays
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
@@ -24,7 +25,6 @@ from hnerf.warp_import import wp
 
 Rng = np.random.Generator
 
-NOSE, R_HIP, R_KNEE, L_HIP, L_KNEE, R_EAR, L_EAR = 0, 9, 10, 12, 13, 17, 18  # BODY_25
 RING_VERTICES, RINGS = 64, 24  # of a tube
 ANGLES = 2 * np.pi * np.arange(RING_VERTICES)[:, None] / RING_VERTICES
 FOLDS, FOLD_DEPTH = 8, 0.3  # of the skirt; the depth is a share of the hem's distance
@@ -106,7 +106,9 @@ class LitGarment:
 def skirt(keypoints_m: np.ndarray, up: np.ndarray, flare_m: float, rng: Rng) -> Garment:
     """Return a skirt around both thighs, from the hips to the knees of keypoints (n, 25, 3). flare_m: distance of its
     hem from the thighs."""
-    right_hip, left_hip, right_knee, left_knee = (keypoints_m[:, k] for k in (R_HIP, L_HIP, R_KNEE, L_KNEE))
+    right_hip, left_hip, right_knee, left_knee = (
+        keypoints_m[:, k] for k in (Body25.R_HIP, Body25.L_HIP, Body25.R_KNEE, Body25.L_KNEE)
+    )
     width_m = float(np.linalg.norm(right_hip - left_hip, axis=1).mean())
     hips_m, knees_m = (right_hip + left_hip) / 2, (right_knee + left_knee) / 2
     left, back = _level_axes(left_hip - right_hip, hips_m - knees_m)
@@ -123,9 +125,9 @@ def skirt(keypoints_m: np.ndarray, up: np.ndarray, flare_m: float, rng: Rng) -> 
 def long_hair(keypoints_m: np.ndarray, up: np.ndarray, length_m: float, rng: Rng) -> Garment:
     """Return hair of length length_m that hangs from the back of the head, between the ears of keypoints (n, 25, 3). up
     (3,)."""
-    ears_m = (keypoints_m[:, R_EAR] + keypoints_m[:, L_EAR]) / 2
-    head_m = float(np.linalg.norm(keypoints_m[:, R_EAR] - keypoints_m[:, L_EAR], axis=1).mean())
-    front, left = _level_axes(keypoints_m[:, NOSE] - ears_m, up)
+    ears_m = (keypoints_m[:, Body25.R_EAR] + keypoints_m[:, Body25.L_EAR]) / 2
+    head_m = float(np.linalg.norm(keypoints_m[:, Body25.R_EAR] - keypoints_m[:, Body25.L_EAR], axis=1).mean())
+    front, left = _level_axes(keypoints_m[:, Body25.NOSE] - ears_m, up)
     drop_m = np.linspace(0, length_m, RINGS)[:, None]
     sway_m = SWAY * drop_m**2 / length_m * np.sin(_phases(len(keypoints_m), rng)[:, 0])
     middles_m = ears_m[:, None] - drop_m * up - (BACK * head_m + FALLS_BACK * drop_m) * front[:, None]

@@ -9,12 +9,13 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from hnerf.capture.body_25 import LEFT_ARM, LEFT_LEG, RIGHT_ARM, RIGHT_LEG
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
 from hnerf.capture.subject import subject_keypoints
 from hnerf.errors import NotApplicableError
 
-LIMBS = ((3, 4), (6, 7), (10, 11), (13, 14))  # BODY_25: elbow to wrist, knee to ankle; right, left
+LIMBS = (RIGHT_ARM[1], LEFT_ARM[1], RIGHT_LEG[1], LEFT_LEG[1])  # forearms and shins
 BEYOND = 0.5  # as a share of a limb's length: where the hand or foot ends
 THICKNESS = 0.8  # of the part that is cut, as a share of a limb's length
 HOLE_RADIUS = 0.1  # as a share of the square root of a mask's area

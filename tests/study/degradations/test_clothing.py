@@ -6,6 +6,7 @@ import torch
 import trimesh
 
 from hnerf.body.fit_result import BodyFit
+from hnerf.capture.body_25 import Body25
 from hnerf.capture.capture import Capture, write_image
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.degradations import clothing
@@ -24,7 +25,7 @@ def standing() -> np.ndarray:
         ("R_HIP", -0.1, 0, 1.0), ("L_HIP", 0.1, 0, 1.0), ("R_KNEE", -0.15, 0, 0.5), ("L_KNEE", 0.15, 0, 0.5),
         ("R_EAR", -0.08, 0, 1.6), ("L_EAR", 0.08, 0, 1.6), ("NOSE", 0, -0.1, 1.6),
     ):  # fmt: skip
-        keypoints_m[:, getattr(clothing, name)] = x, y, z
+        keypoints_m[:, Body25[name]] = x, y, z
     return keypoints_m
 
 
@@ -50,7 +51,7 @@ def test_a_garment_is_a_closed_surface_facing_outwards() -> None:
     """Around knees that touch, a skirt without flare is a truncated cone with radii of 0.2 and 0.1 m, 0.5 m high.
     Having 64 corners takes off 0.16 %."""
     keypoints_m = standing()
-    keypoints_m[:, [clothing.R_KNEE, clothing.L_KNEE], 0] = 0
+    keypoints_m[:, [Body25.R_KNEE, Body25.L_KNEE], 0] = 0
     made = skirt(keypoints_m, UP, 1e-9, np.random.default_rng(0))
     mesh = trimesh.Trimesh(made.vertices_m[0], made.faces, process=False)
     assert mesh.is_watertight
