@@ -51,7 +51,7 @@ class Capture:
     `frame_offsets`: of cameras that are not synchronised (hnerf.capture.timing); `stored_frames`: the frames in the
     files, if some were dropped since; `frame_step`: the distance of frame numbers in the recording. `recorded_lenses`:
     K and distortion of the recorded files, for cameras that were undistorted. `subject_point`: None if nobody is named.
-    `stature_m`: the person's, if `capture.toml` states it.
+    `stature_m`: the person's, if `capture.toml` states it. `notes`: how cameras and clocks were found, for the report.
     """
 
     name: str
@@ -72,6 +72,7 @@ class Capture:
     recorded_lenses: dict[str, tuple[list[list[float]], list[float]]] = dataclasses.field(default_factory=dict)
     subject_point: SubjectPoint | None = None
     stature_m: float | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -238,7 +239,7 @@ class Capture:
         tuples = ("train_cameras", "test_cameras", "train_frames", "novel_pose_frames")
         sizes = ("calibrated_sizes_px", "recorded_sizes_px")
         plain |= {k: tuple(plain[k]) for k in tuples}
-        plain["stored_frames"] = tuple(plain.get("stored_frames", ()))
+        plain |= {k: tuple(plain.get(k, ())) for k in ("stored_frames", "notes")}
         plain |= {k: {name: tuple(size) for name, size in plain[k].items()} for k in sizes}
         plain["picture_areas_px"] = {name: Area(*area) for name, area in plain.get("picture_areas_px", {}).items()}
         if point := plain.get("subject_point"):

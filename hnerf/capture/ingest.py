@@ -2,6 +2,7 @@
 
 import logging
 import unicodedata
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, Capture, SubjectPoint
-from hnerf.capture.clocks import InStep, in_step, warn_if_uneven
+from hnerf.capture.clocks import Clock, InStep, in_step, warn_if_uneven
 from hnerf.capture.footage import Footage, Video, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
@@ -139,6 +140,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, layout: Layout | 
         frame_step=median_step(recorded),
         subject_point=_subject_point(manifest, normalisers, wanted),
         stature_m=manifest.stature_m,
+        notes=(*layout.notes(), *_clock_notes(clocks)),
         recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
     capture.save()
@@ -152,6 +154,12 @@ def lacks_calibration(folder: Path) -> bool:
     if known or path_in_capture(folder, "calibration", "extrinsic").exists():
         return False
     return folder.is_dir() and len(cameras_without_calibration(folder)) > 1
+
+
+def _clock_notes(clocks: Mapping[str, Clock]) -> list[str]:
+    """Return what the report says about clocks: nothing without any."""
+    starts = ", ".join(f"{name} {clock.offset_s:+.3f} s" for name, clock in clocks.items())
+    return [f"images are matched by the cameras' clocks, which at one instant show: {starts}"] if clocks else []
 
 
 def exported_lenses(folder: Path) -> list[Lens]:

@@ -64,6 +64,10 @@ def test_a_recording_without_calibration_is_ingested_with_cameras_from_the_perso
     capture = Capture.load(ingest_recording(Store(tmp_path / "store"), source, load_settings("fast")).root)
     found = align([capture.cameras[camera.name] for camera in truth], truth)
     assert max(np.linalg.norm(a.centre_m - b.centre_m) for a, b in zip(found, truth, strict=True)) < 0.03
+    assert capture.notes[0].startswith(
+        "no calibration, so cameras were found from the person; scale: a person of 1.80 m"
+    )
+    assert len(capture.notes) == 1
     made = {path.name for path in (tmp_path / "store" / "cameras").glob("*/*")}
     assert made == {"intri.yml", "extri.yml", "report.json"}
 
@@ -119,5 +123,11 @@ def test_the_capture_is_ingested_in_step_by_the_clocks_that_were_found(tmp_path:
         found, [dataclasses.replace(pinhole(c), name=n, size_px=(64, 48)) for n, c in zip("ab", ring(2), strict=True)]
     )
     write_clocks(found / "clocks.toml", {"a": Clock(), "b": Clock(0.08)})
+    (found / "report.json").write_text('{"notes": ["scale: 1 %"]}')
     capture = ingest(folder, CaptureSettings(), tmp_path / "out", FromPerson(folder, found))
     assert capture.frames == tuple(range(7))
+    assert (
+        capture.notes[1]
+        == "images are matched by the cameras' clocks, which at one instant show: a +0.000 s, b +0.080 s"
+    )
+    assert Capture.load(tmp_path / "out").notes == capture.notes

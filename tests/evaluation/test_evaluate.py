@@ -66,7 +66,7 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
     base = tmp_path_factory.mktemp("scored")
     capture = write_ball_capture(base / "capture")
     write_ball_truth(capture, RADIUS_M + GAP_M)
-    inputs = ball_inputs(capture)
+    inputs = ball_inputs(dataclasses.replace(capture, notes=("cameras from the person",)))
     avatar = BallAvatar(tuned(inputs.fitted), PHOTOGRAPHED, PHOTOGRAPHED - RENDERED)
     inputs = dataclasses.replace(inputs, avatar=avatar)
     history = [{"step": k, "seconds": 2.0 * k, "losses": {"rec": 0.1}, "held_out": {"psnr": 20.0 + k}} for k in (0, 1)]
@@ -362,7 +362,7 @@ def test_the_report_shows_scores_findings_and_charts(scored: Scored) -> None:
     assert f"{found['novel_view']['psnr']:.2f}" in text
     assert ">3 images, 1 surface<" in text
     assert '<span class="status rejected">' in text and "9.25" in text
-    for doubt in ("left and right are exchanged", "limbs have no depth"):
+    for doubt in ("cameras from the person", "left and right are exchanged", "limbs have no depth"):
         assert doubt in text.partition("<nav>")[0]  # doubts are at the top
     assert "a processor" in text and "12.5" in text
     assert 'alt="Losses"' in text and 'alt="Held-out quality"' in text

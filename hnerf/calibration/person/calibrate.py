@@ -88,7 +88,7 @@ class PersonCalibration:
 
     def notes(self) -> list[str]:
         """Return notes about the whole rig, in words."""
-        mean = "" if self.height_given else ", the mean of adults (give --height)"
+        mean = "" if self.height_given else ", the mean of adults (state stature_m in capture.toml)"
         return [
             f"scale: a person of {self.height_m:.2f} m{mean}, +- {100 * self.scale_sd:.0f} %",
             f"up: from trunk and feet, +- {self.up_sd_deg:.1f} degrees; the ground is at 0, Z is up",

@@ -1,5 +1,6 @@
 """A recording without calibration, whose cameras and clocks the stage `cameras` found from the person."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,8 @@ from hnerf.capture.lens import Lens
 
 @dataclass(frozen=True)
 class FromPerson(EasyMocap):
-    """A capture folder that lacks only cameras and clocks, which are in `found`: `intri.yml`, `extri.yml`, and
-    `clocks.toml` unless the cameras are in step. They are in metres, with Z up."""
+    """A capture folder that lacks only cameras and clocks, which are in `found`: `intri.yml`, `extri.yml`,
+    `report.json`, and `clocks.toml` unless the cameras are in step. They are in metres, with Z up."""
 
     found: Path
 
@@ -22,3 +23,8 @@ class FromPerson(EasyMocap):
     def clocks(self) -> dict[str, Clock]:
         """Return the clocks that were found; empty if there are none."""
         return read_clocks(self.found)
+
+    def notes(self) -> list[str]:
+        """Return how certain scale and vertical axis are."""
+        report = json.loads((self.found / "report.json").read_text())
+        return [f"no calibration, so cameras were found from the person; {'; '.join(report['notes'])}"]

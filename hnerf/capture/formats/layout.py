@@ -59,6 +59,10 @@ class Layout(ABC):
         """Return the cameras' clocks; empty if they are in step. Raises InputError on a bad value."""
         return read_clocks(self.folder)
 
+    def notes(self) -> list[str]:
+        """Return what the report says about the cameras; empty for a calibration of the recording's own."""
+        return []
+
     def training_cameras(self) -> list[str]:
         """Return the cameras that the recording's own publication trains on, the rest being for testing; an empty list
         means all."""

@@ -208,7 +208,7 @@ def test_without_a_height_the_mean_is_used_and_reported(tmp_path: Path) -> None:
     capture = write_capture(tmp_path, without_poses(truth), detections(truth, 1.0))
     found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), None)
     assert found.scale_sd == pytest.approx(np.hypot(0.03, 0.09 / 1.65))
-    assert found.notes()[0] == "scale: a person of 1.65 m, the mean of adults (give --height), +- 6 %"
+    assert found.notes()[0] == "scale: a person of 1.65 m, the mean of adults (state stature_m in capture.toml), +- 6 %"
 
 
 def test_a_lens_is_given_for_images_of_the_recorded_size(tmp_path: Path) -> None:
