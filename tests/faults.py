@@ -300,6 +300,8 @@ FAULTS = (
     Fault("hands-of-anybody", "detection/hands", "hands[i] = given[i, person]", "hands[i] = given[i, 0]"),
     Fault("hands-given-ignored", "detection/hands", "for name in people if name not in own}", "for name in people}"),
     Fault("hands-given-rarely", "detection/hands", "2 * shown.sum() > seen.sum()", "shown.any()"),
+    Fault("hands-of-own-network", "detection/detect", "        write_points(out / GIVEN_HANDS, hands)\n", "",
+          seen_by="detection/keypoint_network"),
     Fault("hands-given-outlive-people", "detection/detect", "(out / GIVEN_HANDS).unlink(missing_ok=True)", "pass"),
     Fault("hands-in-the-body", "capture/keypoint_sets", "points.shape[-2] - HAND_POINTS in COUNTS", "False"),
     Fault("fingers-median", "body/fingers", "turns[seen, joints].quantile", "turns[:, joints].quantile"),

@@ -18,7 +18,7 @@ import numpy as np
 
 from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, LANDMARKS, PERSON, Capture, to_8_bit, write_image
 from hnerf.capture.keypoint_files import pad_people
-from hnerf.capture.keypoint_sets import to_body_25
+from hnerf.capture.keypoint_sets import hands_of, to_body_25
 from hnerf.capture.subject import ranked_people
 from hnerf.capture.subset import write_points
 from hnerf.config import DetectionSettings
@@ -54,19 +54,23 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     ms = _find_people(capture, settings, out)
     found = {name: _load(out, name, "points_px") for name in capture.train_cameras}
     people = to_body_25({name: people["points_px"] for name, people in found.items()}, "blazepose_33")
+    hands = dict[str, np.ndarray]()
     if network is not None:
-        people = network.body_25({name: _load(out, name, "own_px")["own_px"] for name in people}, people)
+        own = {name: _load(out, name, "own_px")["own_px"] for name in people}
+        people = network.body_25(own, people)
+        hands = {name: points for name in own if (points := hands_of(own[name])) is not None}
     alone = settings.source == "network" or not capture.has_keypoints
     if alone and not any((points[..., 2] > 0).any() for points in people.values()):
         raise InputError(
             f"{capture.name}: nobody found in any image of the training cameras; a person must be seen from head to "
             "feet, upright, and be no smaller than a tenth of the image"
         )
-    for name, points in people.items():  # keypoints that the network guesses outside the image count as not seen
+    for name, points in (*people.items(), *hands.items()):  # those guessed outside the image count as not seen
         points *= capture.cameras[name].holds(points[..., :2])[..., None]
     copy_folder(capture.root, out)
     if alone:  # the people of the recording's own files are left out
         (out / GIVEN_HANDS).unlink(missing_ok=True)
+        write_points(out / GIVEN_HANDS, hands)
     write_points(out / KEYPOINTS, people if alone else _with_own(capture, people))
     detected = Capture.load(out)
     ranked = ranked_people(detected)

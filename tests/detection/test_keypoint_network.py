@@ -165,6 +165,14 @@ def test_its_keypoints_replace_those_of_blazepose(recording: Capture, tmp_path: 
     assert landmarks["own_px"].shape == (5, 1, 17, 3) and landmarks["points_px"].shape == (5, 1, 33, 3)
 
 
+def test_its_hands_are_those_of_the_people(recording: Capture, tmp_path: Path) -> None:
+    """Of the 133 points, the last 42 are the left and the right hand's; all lie where the one above does."""
+    model = write_network(tmp_path / "n.onnx", *simcc(133, 7, 14, 0.6))
+    detect(recording, DetectionSettings(source="network", model=model), tmp_path / "out")
+    hands, scale = Capture.load(tmp_path / "out").given_hands("01"), 25 * 1.25 / 12
+    np.testing.assert_allclose(hands, np.tile([17.5 - 2 * scale, 4 - 0.5 * scale, 0.6], (5, 1, 2, 21, 1)))
+
+
 def test_a_network_that_is_sure_of_nothing_finds_nobody(recording: Capture, tmp_path: Path) -> None:
     model = write_network(tmp_path / "n.onnx", np.zeros((1, 133, 4, 3)))
     with pytest.raises(InputError, match="nobody found in any image of the training cameras"):
