@@ -9,7 +9,8 @@ from hnerf.capture.masks import Masks
 from hnerf.config import FitSettings
 from hnerf.models import FACE_LANDMARKS, has_model
 from hnerf.progress import timed
-from hnerf.results import FitReport, write_result
+from hnerf.results.files import write_result
+from hnerf.results.preparation import FitReport
 from tasks.calibration import calibrated_capture
 from tasks.stage import stage
 from tasks.store import Artifact

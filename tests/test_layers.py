@@ -10,10 +10,10 @@ import hnerf
 
 ROOT = Path(hnerf.__file__).parent
 FOUNDATION = ("errors", "evenly_spaced", "tables", "files", "processes", "pycolmap_import", "warp_import", "progress",
-              "side_by_side", "models", "strict_yaml", "config", "results",
-              "onnx_session")  # fmt: skip
-FLOORS = (*FOUNDATION, "geometry", "capture", "detection", "body", "synthetic", "segmentation", "calibration", "fields",
-          "baselines", "avatar", "training", "render", "evaluation", "asset", "study")  # fmt: skip
+              "side_by_side", "models", "strict_yaml", "config", "onnx_session")  # fmt: skip
+FLOORS = (*FOUNDATION, "results", "geometry", "capture", "detection", "body", "synthetic", "segmentation",
+          "calibration", "fields", "baselines", "avatar", "training", "render", "evaluation", "asset",
+          "study")  # fmt: skip
 
 
 def imported(path: Path) -> Iterator[str]:

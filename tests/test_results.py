@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from hnerf.results import FILES, HeldOutCamera, main, write_result, write_schemas
+from hnerf.results.__main__ import main
+from hnerf.results.files import FILES, write_result, write_schemas
+from hnerf.results.scores import HeldOutCamera
 
 SCHEMAS = Path(__file__).parent.parent / "docs" / "schemas"
 MEANS: dict[str, Any] = dict.fromkeys(["psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr"])

@@ -1,7 +1,6 @@
 """Export of a trained avatar to files that any 3-D program opens."""
 
 import dataclasses
-import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -42,6 +41,8 @@ from hnerf.config import AssetSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.progress import timed
 from hnerf.render.motion import Motion, retarget, select_poses
+from hnerf.results.asset import AssetReport
+from hnerf.results.files import write_result
 
 SPLATS = "avatar_splats.usdc"
 
@@ -151,7 +152,7 @@ def export_asset(
         report["captured"] = _mesh_asset_figures(captured, "captured") | {"seconds": captured.seconds}
     if splats:
         report["splats"] = splat_figures(staged, splats)
-    (out / "report.json").write_text(json.dumps(report, indent=1))
+    write_result(out / "report.json", AssetReport, report)
     shown = capture.train_frames[0]
     root = surface.body.root[surface.body.index(shown)].numpy()
     write_report(out / "report.html", capture.name, staged, asset.filled, shown, root, asset.compared, poses, report)

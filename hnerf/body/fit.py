@@ -36,7 +36,7 @@ from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from hnerf.geometry.silhouette import silhouette
 from hnerf.progress import timed
-from hnerf.results import FitReport
+from hnerf.results.preparation import FitReport
 
 log = logging.getLogger("hnerf.fit")
 

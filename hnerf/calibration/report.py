@@ -1,7 +1,6 @@
 """Calibration report: numbers, reasons in words, plots, and the cameras to use (calibrated.py reads them)."""
 
 import dataclasses
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,8 @@ from hnerf.calibration.synchronise import Timing
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.geometry.camera import Camera
+from hnerf.results.files import write_result
+from hnerf.results.preparation import CalibrationCheck
 
 DECIMALS = 4  # of pixels, metres, frames and shares: a tenth of a millimetre, far below what is measured
 NO_KEYPOINTS = Timing.unknown("no keypoints")
@@ -80,7 +81,7 @@ class CalibrationReport:
         out.mkdir(parents=True, exist_ok=True)
         rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
         write_easymocap(out, [pinhole(camera) for name, camera in self.cameras.items() if name not in rejected])
-        (out / "report.json").write_text(json.dumps(_rounded(self._to_dict()), indent=1, allow_nan=False))
+        write_result(out / "report.json", CalibrationCheck, _rounded(self._to_dict()))
         status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
         draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
         if self.evidence and self.after:

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 
 from hnerf.errors import InputError
+from hnerf.results.files import write_result
+from hnerf.results.preparation import SegmentationReport
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Masks:
             path = out / "masks" / camera / f"{frame:06d}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(png)
-        (out / "report.json").write_text(json.dumps(self.report, indent=1))
+        write_result(out / "report.json", SegmentationReport, self.report)
 
     @staticmethod
     def load(out: Path) -> "Masks":

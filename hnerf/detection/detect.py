@@ -1,6 +1,5 @@
 """Detection of people in the training images of a capture: keypoints, landmarks in metres and soft masks."""
 
-import json
 import multiprocessing
 import os
 import signal
@@ -34,6 +33,8 @@ from hnerf.models import POSE_DETECTOR, model_file
 from hnerf.processes import end_with_parent
 from hnerf.progress import report as report_progress
 from hnerf.progress import tracked
+from hnerf.results.files import write_result
+from hnerf.results.preparation import DetectionReport
 
 PROGRESS_S = 0.5  # between two counts of the finished images
 
@@ -80,7 +81,7 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
         keep_subject(out, capture, name, subject, people[name], _load(out, name, "masks", "regions"))
     draw_people(out / PICTURE, detected, ranked)
     report = {"cameras": {name: _summary(people) for name, people in found.items()}, "people": people_rows(ranked)}
-    (out / REPORT).write_text(json.dumps(report, indent=1))
+    write_result(out / REPORT, DetectionReport, report)
     return report | {"ms": ms}
 
 

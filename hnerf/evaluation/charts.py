@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hnerf.results import ImageScores
+from hnerf.results.scores import ImageScores
 
 COLOURS = ("#1f5fa8", "#e0701a", "#2b8a57", "#b23a48", "#6a4c93", "#8a6d3b", "#11808a", "#9a9a9a", "#d14d9a", "#3d3d3d")
 INK, FAINT = "#25292e", "#d9dde2"

@@ -34,7 +34,8 @@ from hnerf.evaluation.views import (
 )
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.progress import tracked
-from hnerf.results import Metrics, write_result
+from hnerf.results.files import write_result
+from hnerf.results.scores import Metrics
 from hnerf.side_by_side import side_by_side
 
 log = logging.getLogger("hnerf.evaluation")

@@ -17,7 +17,8 @@ from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.ground_truth import OwnMasks
 from hnerf.evaluation.images import mean_of, render, score_split, scored_views, unscored
 from hnerf.evaluation.views import PRIMARY_SPLITS
-from hnerf.results import HeldOutCamera, write_result
+from hnerf.results.files import write_result
+from hnerf.results.scores import HeldOutCamera
 
 EACH = "each"
 MIN_CAMERAS = 2  # that must remain for training

@@ -14,7 +14,7 @@ from hnerf.evaluation import metrics
 from hnerf.evaluation.ground_truth import Truth
 from hnerf.evaluation.views import NOVEL_POSE_SPLITS, View, all_views, sample_views
 from hnerf.progress import tracked
-from hnerf.results import ImageScores, Mean, SplitScores
+from hnerf.results.scores import ImageScores, Mean, SplitScores
 from hnerf.side_by_side import side_by_side
 
 MEANS: tuple[Mean, ...] = get_args(Mean)  # averaged over a split's images

@@ -31,7 +31,7 @@ from hnerf.evaluation.views import (
     sample_views,
 )
 from hnerf.files import png_data_uri
-from hnerf.results import HeldOutCamera, Metrics, Split
+from hnerf.results.scores import HeldOutCamera, Metrics, Split
 from hnerf.tables import pick, shown
 
 FIGURES = (  # key in a split's scores, name, unit, format, meaning

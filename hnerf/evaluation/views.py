@@ -6,7 +6,7 @@ from typing import Literal
 
 from hnerf.capture.capture import Capture
 from hnerf.evenly_spaced import evenly_spaced
-from hnerf.results import Primary, Split
+from hnerf.results.scores import Primary, Split
 
 NOVEL_VIEW: Literal["novel_view"] = "novel_view"
 ANIMATED: Literal["novel_pose"] = "novel_pose"  # the columns of hnerf/evaluation/columns.py

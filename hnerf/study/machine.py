@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from hnerf.results import Machine
+from hnerf.results.scores import Machine
 
 
 def machine() -> Machine:

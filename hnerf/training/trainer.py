@@ -24,7 +24,8 @@ from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.progress import report
-from hnerf.results import TrainingReport, write_result
+from hnerf.results.files import write_result
+from hnerf.results.training import TrainingReport
 from hnerf.training.auto_settings import SceneStatistics, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint, training_key
 from hnerf.training.distributed import Distributed

@@ -6,7 +6,7 @@ import pytest
 
 from hnerf.config import FitSettings
 from hnerf.models import FACE_LANDMARKS
-from hnerf.results import FitReport
+from hnerf.results.preparation import FitReport
 from tasks import fit as module
 from tasks import stage
 from tasks.store import Artifact, Store

@@ -2,7 +2,6 @@
 shows."""
 
 import dataclasses
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +26,8 @@ from hnerf.capture.timing import median_step
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
+from hnerf.results.files import write_result
+from hnerf.results.preparation import CamerasReport
 
 PARTS = 5  # of the frames and of the joints: each is left out once
 MIN_MOTION = 0.05  # of the stature: how far parts of the person must move, three times a detector's noise
@@ -97,7 +98,7 @@ class PersonCalibration:
     def save(self, out: Path, layouts: Sequence[str] = (), pose2sim: bool = False) -> None:
         """Write `report.json`, and the cameras as `write_calibration` does."""
         write_calibration(out, self.lenses, "person", layouts, pose2sim)
-        (out / "report.json").write_text(json.dumps(self.report(), indent=1))
+        write_result(out / "report.json", CamerasReport, self.report())
 
 
 def calibrate_from_person(

@@ -24,7 +24,8 @@ from hnerf.evaluation.pictures import crop, frame_person
 from hnerf.evaluation.views import PRIMARY_SPLITS, SPLITS, View, all_views, split_frames
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
-from hnerf.results import CurvePoint, EndScores, ImageScores, Picture, Scores, SplitScores, write_result
+from hnerf.results.files import write_result
+from hnerf.results.scores import CurvePoint, EndScores, ImageScores, Picture, Scores, SplitScores
 from hnerf.study.benchmark.plan import ScoringSettings
 from hnerf.study.benchmark.training_distance import pose_distances_deg, view_angle_deg
 from hnerf.study.machine import machine

@@ -1,66 +1,12 @@
-"""Types of the JSON files that stages write: every key with its type and unit. Writing a file with any other key fails.
+"""Scores: `metrics.json` and `holdout.json` of evaluation, `scores.json` of benchmarks."""
 
-`python -m hnerf.results FOLDER` writes the JSON schema of each file, as in docs/schemas/.
-"""
-
-import argparse
-import json
-from pathlib import Path
 from typing import Any, Literal, NotRequired
 
-from pydantic import ConfigDict, TypeAdapter, with_config
 from typing_extensions import TypedDict
 
 Split = Literal["novel_view", "novel_pose", "novel_pose_posed", "novel_pose_tracked"]
 Mean = Literal["psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr"]
 Primary = Literal["novel_view", "novel_pose"]  # these splits are meshed and score held-out cameras
-
-
-class FitReport(TypedDict):
-    """report.json of the body fit, before its face was moved; lists have one value per frame. seconds: duration of each
-    part, not written to the file. silhouette_iou: IoU of the body's silhouette with the masks, null without masks.
-    beta: shape values by name. keypoint_offsets_m (25, 3): offset between where the detector and the body model place
-    each keypoint. given_poses: how poses that came with the recording were used. on_ground: with one camera, whether
-    world height 0 was taken as the ground; doubts: what that camera does not determine."""
-
-    seconds: NotRequired[dict[str, float]]
-    frames: list[int]
-    keypoint_residual_px: list[float | None]
-    silhouette_iou: list[float | None] | None
-    poor_frames: list[int]
-    stature_m: float
-    beta: dict[str, float]
-    keypoint_offsets_m: list[list[float]]
-    given_poses: NotRequired[str]
-    on_ground: NotRequired[bool]
-    doubts: NotRequired[list[str]]
-
-
-class ChosenSetting(TypedDict):
-    """A setting whose value was chosen from the scene, and the reason."""
-
-    setting: str
-    value: Any
-    reason: str
-
-
-class TrainingReport(TypedDict):
-    """report.json of training. seconds: duration of the steps of both phases; field_seconds: of the field's own steps;
-    setup_seconds: of the preparation before the first step, included in neither. mean_turn_deg, mean_move_mm: mean
-    change of all poses since the body fit."""
-
-    device: str
-    processes: int
-    setup_seconds: float
-    seconds: float
-    field_seconds: float
-    steps: int
-    peak_memory_gib: float
-    parameters: int
-    model_mib: float
-    mean_turn_deg: float
-    mean_move_mm: float
-    decisions: list[ChosenSetting]
 
 
 class ImageScores(TypedDict):
@@ -213,42 +159,3 @@ class Scores(EndScores):
     novel_pose_tracked: SplitScores
     pictures: list[Picture]
     frame_seconds: dict[str, float]
-
-
-FILES: dict[str, Any] = {
-    "fit-report": FitReport,
-    "training-report": TrainingReport,
-    "metrics": Metrics,
-    "holdout": HeldOutCamera,
-    "scores": Scores,
-}
-
-
-def _closed(kind: Any) -> TypeAdapter[Any]:
-    """Return a validator of a kind of result that forbids other keys, also in nested parts."""
-    return TypeAdapter(with_config(ConfigDict(extra="forbid"))(kind))
-
-
-def write_result(path: Path, kind: Any, result: Any) -> None:
-    """Write a result as JSON. Raise ValidationError if it has a key that its kind does not define, or a value of
-    another type."""
-    _closed(kind).validate_python(result)
-    path.write_text(json.dumps(result, indent=1))
-
-
-def write_schemas(folder: Path) -> None:
-    """Write `<name>.json`, the JSON schema of each kind of result, into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, kind in FILES.items():
-        (folder / f"{name}.json").write_text(json.dumps(_closed(kind).json_schema(), indent=1) + "\n")
-
-
-def main(argv: list[str] | None = None) -> None:
-    """Write the schemas to the folder given on the command line."""
-    parser = argparse.ArgumentParser(prog="python -m hnerf.results", description="Write a JSON schema of each result.")
-    parser.add_argument("folder", type=Path, help="where to, like docs/schemas")
-    write_schemas(parser.parse_args(argv).folder)
-
-
-if __name__ == "__main__":
-    main()
