@@ -12,6 +12,7 @@ from PIL import Image
 
 from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.ingest import ingest
+from hnerf.capture.video_metadata import is_hdr
 from hnerf.config import CaptureSettings
 from tests.capture import recordings as rec
 from tests.capture.mp4 import state_transfer, write_video
@@ -77,12 +78,22 @@ def test_capture_toml_sets_names_and_splits(folder: Path, tmp_path: Path) -> Non
     assert {p.name[:6] for p in (tmp_path / "out" / "images" / "01").iterdir()} == {"000001", "000003", "000004"}
 
 
-@pytest.mark.parametrize(("transfer", "warns"), {"Rec. 709": (1, False), "PQ": (16, True), "HLG": (18, True)}.values())
-def test_hdr_video_gets_a_warning(transfer: int, warns: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(("transfer", "hdr"), {"Rec. 709": (1, False), "PQ": (16, True), "HLG": (18, True)}.values())
+def test_videos_state_whether_they_are_hdr(transfer: int, hdr: bool, tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [10])
+    state_transfer(tmp_path / "a.mp4", transfer)
+    assert is_hdr(tmp_path / "a.mp4") == hdr
+
+
+@pytest.mark.parametrize("hdr", [False, True])
+def test_hdr_video_gets_a_warning(
+    hdr: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The video itself is ordinary: OpenCV takes seconds to open one that is HDR."""
+    monkeypatch.setattr("hnerf.capture.ingest.is_hdr", lambda _: hdr)
     write_video(tmp_path / "film" / "a.mp4", [10, 20, 30])
-    state_transfer(tmp_path / "film" / "a.mp4", transfer)
     ingest(tmp_path / "film", CaptureSettings(), tmp_path / "out")
-    assert ("a.mp4: colours of HDR video" in caplog.text) == warns
+    assert ("a.mp4: colours of HDR video" in caplog.text) == hdr
 
 
 def test_files_of_uncalibrated_cameras_get_a_warning(

@@ -260,7 +260,7 @@ def test_a_folder_renamed_while_it_is_read_is_trained_under_its_new_name(
         raise InputError("0.jpg: image missing")
 
     look(watched)
-    monkeypatch.setattr("tasks.capture.run_caged", read)
+    monkeypatch.setattr("tasks.cage.run_caged", read)
     with pytest.raises(InputError, match="ada: changed or moved since the command started"):
         train_subject.fn(Path(runs[0]["capture"]), "demo", watched.parent / "store")
     assert look(watched) == ["eve"]

@@ -181,8 +181,8 @@ def _check_determined(
     length, width = np.linalg.svd(centres - centres.mean(0))[1][:2]
     if unknown_focal and width < COLLINEAR * length:
         raise InputError(
-            "all cameras stand in one line, which leaves their focal length open; give it (--fov or --lens), or add "
-            "a camera beside that line"
+            "all cameras stand in one line, which leaves their focal length open; give it "
+            "(field_of_view_deg in capture.toml, --fov or --lens), or add a camera beside that line"
         )
 
 
@@ -239,7 +239,7 @@ def _check_uncertainty(cameras: Sequence[Camera], uncertainty: dict[str, Uncerta
         raise InputError(
             f"camera {name} is not determined (+- {uncertainty[name].turn_deg:.1f} degrees, "
             f"{100 * uncertainty[name].move_m:.0f} cm): film longer, with the person walking and turning, or give the "
-            "field of view (--fov)"
+            "field of view (field_of_view_deg in capture.toml, or --fov)"
         )
 
 

@@ -254,7 +254,7 @@ def test_cameras_in_one_line_cannot_find_the_focal_length(count: int, tmp_path: 
     """Two cameras are always in one line."""
     line = [look_at(f"c{i}", np.array([3.5, 2.0 * i - 2, 1.2]), np.array([0, 0, 0.9])) for i in range(count)]
     message = refusal(tmp_path, line, detections(line, 1.0), [camera.name for camera in line])
-    assert "one line" in message and message.endswith("give it (--fov or --lens), or add a camera beside that line")
+    assert "one line" in message and message.endswith("or --lens), or add a camera beside that line")
 
 
 def test_too_few_shared_keypoints_are_refused(tmp_path: Path) -> None:
