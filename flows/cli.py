@@ -36,7 +36,8 @@ FOLDERS = {
     "subject": "<store>/subjects/<name> of a finished `hnerf run`",
 }  # options of commands that are folders, and what each is
 
-MOTIONS = "a BVH file, an AMASS .npz, or another subject's folder"
+MOTIONS = "a BVH file, an AMASS .npz, another subject's folder, or t-pose"
+T_POSE = Path("t-pose")  # as in hnerf.render.motion, which imports torch
 
 Command = Callable[[argparse.Namespace], None]
 log = logging.getLogger("hnerf")
@@ -134,7 +135,7 @@ def _existing(options: argparse.Namespace) -> list[Path]:
             raise InputError(f"{folder}: {'is not a' if folder.exists() else 'no such'} {wanted}; give {what}")
     motions = getattr(options, "motion", None) or []
     for motion in motions if isinstance(motions, list) else [motions]:
-        if not motion.exists():
+        if not motion.exists() and motion != T_POSE:
             raise InputError(f"{motion}: no such file; give {MOTIONS}")
     if isinstance(out := getattr(options, "out", None), Path):
         _require_outside_artifacts(out)

@@ -514,6 +514,8 @@ FAULTS = (
     Fault("limit-end", "tasks/limits", "exit=True", "exit=False"),
     Fault("cage-unused", "tasks/capture", "read_source(source, ingest_folder, source.root, settings, out, layout)",
           "ingest_folder(source.root, settings, out, layout)"),
+    Fault("t-pose-mirror", "body/t_pose", "1.0 if side == \"L\" else -1.0", "1.0"),
+    Fault("t-pose-feet", "body/t_pose", "if bone == \"foot\" else above", "if False else above"),
     Fault("cameras-of-one", "capture/ingest", "len(cameras_without_calibration(folder)) > 1\n",
           "len(cameras_without_calibration(folder)) > 0\n", seen_by="capture/uncalibrated"),
     Fault("cameras-boards", "capture/ingest", "if known or path_in_capture(", "if known or not path_in_capture(",

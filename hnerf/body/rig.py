@@ -123,6 +123,14 @@ def _require_agreement(arrays: Mapping[str, np.ndarray]) -> None:
             raise ValueError(f"{name} has an index beyond {sizes[counted]}")
 
 
+def shortest_rotation(a: Tensor, b: Tensor) -> Tensor:
+    """Return the rotation (3, 3) of direction a into b, which is not opposite, about their common normal
+    (Rodrigues)."""
+    a, b = a / a.norm(), b / b.norm()
+    cross = cross_matrix(torch.linalg.cross(a, b))
+    return torch.eye(3, dtype=a.dtype) + cross + cross @ cross / (1 + a @ b)
+
+
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
     """Return rotations (..., 3, 3) of axis-angle (..., 3) in radians, by Rodrigues' formula with finite gradients at
     zero."""

@@ -17,7 +17,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
-from hnerf.body.rig import Rig, cross_matrix
+from hnerf.body.rig import Rig, shortest_rotation
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.capture.safe_pickle import MAX_BYTES, read_pickle
 from hnerf.errors import InputError, raise_if_unreachable
@@ -131,17 +131,9 @@ def rest_rotations(names: tuple[str, ...], parents: list[int], t_pose: dict[str,
         if limb in REST_BONES:
             mirror = torch.tensor([1.0 if side == "L" else -1.0, 1, 1], dtype=torch.float64)
             target = torch.tensor(REST_BONES[limb], dtype=torch.float64) * mirror
-            above = _shortest_rotation(above @ t_pose[name], target) @ above
+            above = shortest_rotation(above @ t_pose[name], target) @ above
         rotations.append(torch.eye(3, dtype=torch.float64) if limb == "foot" else above)
     return torch.stack(rotations)
-
-
-def _shortest_rotation(a: Tensor, b: Tensor) -> Tensor:
-    """Return the rotation (3, 3) of direction a into b, which is not opposite, about their common normal
-    (Rodrigues)."""
-    a, b = a / a.norm(), b / b.norm()
-    cross = cross_matrix(torch.linalg.cross(a, b))
-    return torch.eye(3, dtype=a.dtype) + cross + cross @ cross / (1 + a @ b)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from hnerf.body.body_model import body_model
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import initial_pose_from_given
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
+from hnerf.body.t_pose import t_pose
 from hnerf.capture.capture import Capture
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
@@ -32,6 +33,7 @@ BODY_JOINTS = 22
 HIPS = ("upperleg01.L", "upperleg01.R")
 LEG = "upperleg01.L", "foot.L"
 DEFAULT_FPS = 30.0  # of AMASS files without a rate
+T_POSE = Path("t-pose")  # stands for that pose in place of a motion's file
 BELOW_FLOOR = 0.05  # share of a motion's frames with a foot below its floor, due to errors
 MAX_MOTION_BYTES = 256_000_000  # unpacked; half an hour of SMPL-H at 100 poses a second
 
@@ -46,6 +48,11 @@ class Motion:
     up: str
 
 
+def t_pose_motion(rig: Rig) -> Motion:
+    """Return the T pose of a rig as a motion of one frame."""
+    return Motion(BodyFit(rig, (0,), t_pose(rig)[None], torch.eye(4)[None]), DEFAULT_FPS, "z")
+
+
 def read_motion(path: Path, frames: str = ":") -> Motion:
     """Read a motion: frames (see `select_frames`) of another subject's folder, which holds a capture and a training or
     fit, of a .bvh file (`bvh_motion`), or of an AMASS .npz file.
@@ -54,7 +61,7 @@ def read_motion(path: Path, frames: str = ":") -> Motion:
     Raises InputError if there is no motion or it lacks these frames.
     """
     if not path.exists():
-        raise InputError(f"{path}: no such file; give a .bvh, an AMASS .npz, or <store>/subjects/<name>")
+        raise InputError(f"{path}: no such file; give a .bvh, an AMASS .npz, <store>/subjects/<name> or t-pose")
     if path.is_dir():
         return _subject_motion(path, frames)
     if path.suffix.lower() == ".bvh":

@@ -23,7 +23,16 @@ from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
-from hnerf.render.motion import Motion, interpolate_poses, read_motion, retarget, select_frames, select_poses
+from hnerf.render.motion import (
+    T_POSE,
+    Motion,
+    interpolate_poses,
+    read_motion,
+    retarget,
+    select_frames,
+    select_poses,
+    t_pose_motion,
+)
 from hnerf.render.pictures import Shot, write_pictures
 from hnerf.render.shape import transfer_poses, with_shape_values, with_volume
 from hnerf.render.trajectory import interpolate_cameras, orbit, read_camera_path
@@ -40,9 +49,9 @@ class RenderOptions:
 
     camera: a recorded camera's name; path: a file or folder of cameras to fly along (`read_camera_path`); with neither,
     the camera orbits at this radius and at this height above the person's centre, in metres (`orbit`). motion: another
-    subject's folder, a BVH or an AMASS file (`read_motion`); frames: which of its frames (`select_frames`); between:
-    two frames to interpolate between. shape: amounts added to shape values; volume: relative change. what: kinds of
-    output, from OUTPUT_KINDS. size_px: the longest side of images. pictures: number of images.
+    subject's folder, a BVH or an AMASS file (`read_motion`), or T_POSE; frames: which of its frames (`select_frames`);
+    between: two frames to interpolate between. shape: amounts added to shape values; volume: relative change. what:
+    kinds of output, from OUTPUT_KINDS. size_px: the longest side of images. pictures: number of images.
     """
 
     camera: str | None = None
@@ -89,6 +98,8 @@ def checked_capture(subject: Path, options: RenderOptions) -> Capture:
         raise InputError("--radius and --height are for an orbit; omit them, or omit --camera and --path")
     if options.between and options.frames != ":":
         raise InputError(f"--frames {options.frames}: has no effect with --between; leave it out")
+    if options.motion == T_POSE and options.frames != ":":
+        raise InputError(f"--frames {options.frames}: has no effect with --motion {T_POSE}; leave it out")
     if options.pictures is not None and options.pictures < 1:
         raise InputError(f"{options.pictures} pictures: give 1 or more")
     return recording_of(subject)
@@ -103,7 +114,8 @@ def chosen_motion(subject: Path, options: RenderOptions, capture: Capture) -> Mo
     if options.motion is None:
         motion = Motion(select_poses(own, select_frames(own.frames, options.frames, subject)), capture.fps, capture.up)
     else:
-        motion = read_motion(options.motion, options.frames)
+        posed = options.motion == T_POSE
+        motion = t_pose_motion(own.rig) if posed else read_motion(options.motion, options.frames)
         motion = dataclasses.replace(motion, body=retarget(own, motion, capture.up, options.motion), up=capture.up)
     body = motion.body
     if options.between is not None:

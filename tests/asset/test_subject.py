@@ -3,6 +3,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from hnerf.asset import subject as exported
 from hnerf.asset.subject import export_subject
@@ -109,3 +110,16 @@ def test_blender_adds_its_files_or_nothing_is_written(
         assert (tmp_path / "out" / "avatar.fbx").read_text() == "10.0"
         assert report["bytes"]["avatar.fbx"] == 4 and report["bytes"]["avatar_cache.abc"] == 7
         assert "blender" in report["seconds"]
+
+
+def test_the_t_pose_is_that_of_the_subjects_own_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Any] = []
+    for name, value in (("recording_of", "capture"), ("avatar_of", "avatar")):
+        monkeypatch.setattr(exported, name, lambda subject, value=value: value)
+    monkeypatch.setattr(exported.Masks, "load", lambda folder: "masks")
+    monkeypatch.setattr(exported, "export_asset", lambda *arguments: given.extend(arguments) or {})
+    subject = made(tmp_path / "ada")
+    bending_body().save(subject / "training")
+    export_subject(subject, AssetSettings(), [Path("t-pose")], tmp_path / "out", "")
+    assert list(given[6]) == ["t_pose"] and given[6]["t_pose"].body.frames == (0,)
+    torch.testing.assert_close(given[6]["t_pose"].body.rig.vertices_m, bending_body().rig.vertices_m)

@@ -38,12 +38,12 @@ from tests.shared_data import shared_capture
         ("calibrate . --height 1.8", "hnerf: --height: has no effect with --from boards; leave it out, or give"),
         ("calibrate . --from person --ground-frame 0", "--ground-frame: has no effect with --from person"),
         ("export absent", "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
-        ("export . --motion a.bvh", "a.bvh: no such file; give a BVH file, an AMASS .npz, or another"),
+        ("export . --motion a.bvh", "a.bvh: no such file; give a BVH file, an AMASS .npz, another"),
         (
             "export . --blender absent",
             "hnerf: absent: no such program; give --blender Blender 4.5 or newer, or a",
         ),
-        ("render . --motion a.npz", "a.npz: no such file; give a BVH file, an AMASS .npz, or another"),
+        ("render . --motion a.npz", "a.npz: no such file; give a BVH file, an AMASS .npz, another"),
         ("export . --set asset.bones=up", "hnerf: --set asset.bones=up: asset.bones: Input should be 'along'"),
         (
             "export . --set training.steps=3",

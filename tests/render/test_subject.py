@@ -191,6 +191,7 @@ def test_a_taller_body_reaches_higher_in_the_image(subject: Path, tmp_path: Path
         (["--camera", "0", "--height", "1"], "--radius and --height are for an orbit"),
         (["--frames", "7"], "no frames 7; it has 0 to 2"),
         (["--frames", "0", "--between", "0", "2"], "--frames 0: has no effect with --between; leave it out"),
+        (["--frames", "0", "--motion", "t-pose"], "--frames 0: has no effect with --motion t-pose; leave it out"),
         (["--between", "0", "7"], "no frames 7; it has 0 to 2"),
         (["--motion", "absent.npz"], "absent.npz: no such file"),
         (["--path", "absent.json"], "absent.json: no such file; give --path another"),
