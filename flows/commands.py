@@ -69,6 +69,7 @@ def _write_capture(out: Path, settings: SyntheticSettings) -> None:
 def check_cameras(options: argparse.Namespace) -> None:
     """Check the calibration of a capture, and print a verdict for each camera."""
     from flows.preparation import ingest_recording, with_detections
+    from hnerf.capture.capture import Capture
     from tasks.calibration import calibrate
     from tasks.limits import set_limits
     from tasks.source import read_capture
@@ -79,7 +80,8 @@ def check_cameras(options: argparse.Namespace) -> None:
     source, _ = read_capture(options.capture, options.store)
     recording = with_detections(store, ingest_recording(store, source, settings), settings)
     calibration = calibrate(store, recording, settings.calibration)
-    print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))
+    report = json.loads((calibration.root / "report.json").read_text())
+    print("\n".join([*_table(report), *Capture.load(recording.root).notes]))
     print(f"picture: {calibration.root / 'cameras.png'}")
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import lacks_calibration
 from hnerf.config import Settings
+from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import CapturePart
 from tasks.calibration import calibrate
 from tasks.cameras import find_cameras
@@ -13,7 +14,7 @@ from tasks.detection import detect, find_hands, needs_detection, needs_hands
 from tasks.fit import fit
 from tasks.limits import set_limits
 from tasks.segmentation import converged, needs_body, segment
-from tasks.source import Source
+from tasks.source import GROUND_TRUTH, Source
 from tasks.store import Artifact, Store
 
 
@@ -27,8 +28,13 @@ class Prepared(NamedTuple):
 
 
 def missing_cameras(store: Store, source: Source) -> Artifact | None:
-    """Return clocks and cameras found from the person, if several cameras have no calibration; else None."""
-    return find_cameras(store, source) if lacks_calibration(source.root) else None
+    """Return clocks and cameras found from the person, if several cameras have no calibration; else None. Raises
+    InputError if there is ground truth, which is in the world of a calibration."""
+    if not lacks_calibration(source.root):
+        return None
+    if (source.root / GROUND_TRUTH).exists():
+        raise InputError(f"{source.root / GROUND_TRUTH}: of no use without a calibration; add that, or remove this")
+    return find_cameras(store, source)
 
 
 def ingest_recording(store: Store, source: Source, settings: Settings) -> Artifact:

@@ -30,7 +30,7 @@ from tasks.limits import set_limits
 from tasks.quarantine import clear, note_run
 from tasks.quiet import EXPECTED
 from tasks.remote import fetched, remote_capture
-from tasks.source import GoneError, path_or_url, read_capture
+from tasks.source import GoneError, Source, path_or_url, read_capture
 from tasks.stage import retried
 from tasks.store import OPTIONAL, Artifact, Store
 from tasks.training import train
@@ -77,22 +77,10 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     artifact_store = Store(store.resolve())
     capture = path_or_url(capture)
     source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
-    cameras = missing_cameras(artifact_store, source)
-    recorded = ingest(artifact_store, source, settings.capture, cameras)
-    normalised = Capture.load(recorded.root)
-    held_out_cameras(normalised.train_cameras, normalised.test_cameras, settings.evaluation.holdout)
-    subject = normalised.name
-    artifact_store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
-    link = partial(artifact_store.link_latest, subject)
-    made = (cameras, recorded) if cameras else (recorded,)
-    artifact_store.unlink_latest(subject, {"cameras"} - {one.stage for one in made})
-    for artifact in made:
-        link(artifact)
-    recording = with_detections(artifact_store, recorded, settings)
-    made = (*made, recording)
+    subject, made = ingested(artifact_store, source, capture, settings)
+    recording = made[-1]
     skipped = OPTIONAL - {one.stage for one in made}
-    artifact_store.unlink_latest(subject, skipped)
-    link(recording)
+    link = partial(artifact_store.link_latest, subject)
     calibration = link(calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
     segmentation = link(segment_subject(artifact_store, recording, calibration, settings))
@@ -120,6 +108,26 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     publish_markdown(page, "result", f"Result for {subject}")
     publish_link(trained.report, "report", f"Report on {subject}")
     return trained
+
+
+def ingested(store: Store, source: Source, capture: Path | str, settings: Settings) -> tuple[str, tuple[Artifact, ...]]:
+    """Ingest a recording, detect people as needed, and link the results to the subject; unlink those of an earlier run
+    that used other stages. Return the subject's name and the results; later stages read the last one."""
+    cameras = missing_cameras(store, source)
+    recorded = ingest(store, source, settings.capture, cameras)
+    normalised = Capture.load(recorded.root)
+    held_out_cameras(normalised.train_cameras, normalised.test_cameras, settings.evaluation.holdout)
+    subject = normalised.name
+    store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
+    if cameras:
+        store.link_latest(subject, cameras)
+    else:
+        store.unlink_latest(subject, {"cameras"})
+    store.link_latest(subject, recorded)
+    recording = with_detections(store, recorded, settings)
+    store.unlink_latest(subject, OPTIONAL - {"cameras", recording.stage})
+    store.link_latest(subject, recording)
+    return subject, (cameras, recorded, recording) if cameras else (recorded, recording)
 
 
 @train_subject.on_failure

@@ -4,7 +4,7 @@ A reader that crashes, or that takes all memory, all processors or the network, 
 run sends it its work pickled; it answers in text, one JSON object per line:
 
     {"log": [logger, level, message]}, {"progress": [what, done, total]}, {"opened": path}, {"printed": text}
-    {"error": "InputError" | "OSError" | "other", "arguments": [...]}, at most one
+    {"error": "InputError" | "OSError" | "LostWorkerError" | "other", "arguments": [...]}, at most one
 """
 
 import ctypes
@@ -20,6 +20,7 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, TextIO
@@ -70,7 +71,11 @@ def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> 
             reader.kill()
             raise
     if error:
-        kinds: dict[str, type[Exception]] = {"InputError": InputError, "OSError": OSError}
+        kinds: dict[str, type[Exception]] = {
+            "InputError": InputError,
+            "OSError": OSError,
+            "LostWorkerError": LostWorkerError,
+        }
         raise kinds.get(error["error"], RuntimeError)(*error["arguments"])
     if reader.returncode > 0:
         raise RuntimeError(f"{opened}: its reader ended with exit code {reader.returncode}")
@@ -103,10 +108,10 @@ def _killed(opened: Path, by: signal.Signals) -> Exception:
     if by in KILLED:
         return LostWorkerError(f"{opened}: its reader was killed by {by.name}")
     if by == signal.SIGXCPU:
-        why = f"no progress in {limit_s(1):.0f} s of a processor's time"
+        why = f"no progress in {limit_s(1):.0f} s of a processor's time; export it again, or raise limits.stage_s"
     else:
-        why = f"reading it crashed ({by.name})"
-    return InputError(f"{opened}: {why}; export it again")
+        why = f"reading it crashed ({by.name}); export it again"
+    return InputError(f"{opened}: {why}")
 
 
 def _main(parent: int) -> None:
@@ -150,6 +155,8 @@ def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object
         error = InputError(f"{opened}: {why}; export it again, or raise limits.reader_gib")
     elif number in BEYOND:
         error = InputError(f"{opened}: {BEYOND[number]}; export it again")
+    if isinstance(error, BrokenProcessPool):
+        return {"error": "LostWorkerError", "arguments": [f"{opened}: a process of its reader ended: {error}"]}
     if isinstance(error, InputError):
         return {"error": "InputError", "arguments": [str(error)]}
     if isinstance(error, OSError) and number is None:  # our own, for libraries that do not say why

@@ -11,8 +11,8 @@ from tasks.stage import stage
 @stage("cameras", version="1")
 def find_cameras(out: Path, source: Source) -> dict[str, float]:
     """Find the clocks and cameras of a recording from the person it shows."""
-    from hnerf.calibration.find_cameras import find_cameras as find_in_folder  # takes a second, and few runs need it
+    from hnerf.calibration.find_cameras import find_missing_cameras  # importing this takes a second
 
-    read_source(source, find_in_folder, source.root, out)
+    read_source(source, find_missing_cameras, source.root, out)
     cameras = json.loads((out / "report.json").read_text())["cameras"].values()
     return {"worst_median_px": max(camera["median_px"] for camera in cameras)}

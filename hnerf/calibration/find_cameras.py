@@ -3,47 +3,47 @@
 import logging
 from pathlib import Path
 
-from hnerf.calibration.clocks.recording import synchronise_recording
+from hnerf.calibration.clocks.recording import UndeterminedClocksError, synchronise_recording
 from hnerf.calibration.person.recording import calibrate_recording
 from hnerf.capture.clocks import FILE, Clock, read_clocks, write_clocks
+from hnerf.capture.ingest import RATE_TOLERANCE
 from hnerf.capture.manifest import read_manifest
-from hnerf.capture.safe_io import path_in_capture
-from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
+from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration, image_folders_in
 from hnerf.errors import InputError
 
 log = logging.getLogger("hnerf.calibration")
 
 
-def find_cameras(folder: Path, out: Path) -> None:
+def find_missing_cameras(folder: Path, out: Path) -> None:
     """Write `intri.yml`, `extri.yml` and `report.json` of a recording by several cameras into `out`, and `clocks.toml`
     unless the cameras are in step.
 
     Images of the same number show the same moment; videos may have started at any time. Clocks and lenses that the
     folder states are used. Raises InputError if the recording does not determine the rest.
     """
+    log.warning("%s: no calibration (extri.yml or another): finding cameras from the person takes minutes", folder)
     clocks = read_clocks(folder)
-    if not clocks and not recorded_as_images(folder):
+    if not clocks and not image_folders_in(folder):
         clocks = found_clocks(folder)
     if clocks:
         out.mkdir(parents=True, exist_ok=True)
         write_clocks(out / FILE, clocks)
-    found = calibrate_recording(folder, fov_deg=read_manifest(folder).field_of_view_deg, clocks=clocks)
-    found.save(out)
-    log.warning("%s: no calibration, so cameras were found from the person; %s", folder, "; ".join(found.notes()))
-
-
-def recorded_as_images(folder: Path) -> bool:
-    """Return whether the cameras are folders of images."""
-    return path_in_capture(folder, "images", cameras_without_calibration(folder)[0]).is_dir()
+    calibrate_recording(folder, clocks=clocks).save(out)
 
 
 def found_clocks(folder: Path) -> dict[str, Clock]:
-    """Return the clocks of a folder of videos; empty, with a warning, if they cannot be found and all videos have the
-    same frames, as those of cameras in step have. Raises InputError that says how to state clocks otherwise."""
+    """Return the clocks of a folder of videos. If they cannot be found but all videos have the same frames, warn and
+    return none: the cameras are taken to be in step. Otherwise raise InputError that says how to state them."""
+    point = read_manifest(folder).subject_point
+    if point and point.camera:
+        raise InputError(
+            f"{folder / 'capture.toml'}: subject: a point in an image has no instant before clocks are known; run "
+            f"`hnerf synchronise {folder}` first, or, if the cameras are in step, write {FILE}"
+        )
     try:
         found = synchronise_recording(folder)[0].clocks
-    except InputError as error:
-        if not has_equal_frames(folder):
+    except UndeterminedClocksError as error:
+        if not have_equal_frames(folder):
             raise InputError(f"{error}; or state the clocks in {FILE} (docs/formats.md)") from None
         log.warning("%s; cameras are taken to be in step, since their videos have the same frames", error)
         return {}
@@ -52,8 +52,11 @@ def found_clocks(folder: Path) -> dict[str, Clock]:
     return found
 
 
-def has_equal_frames(folder: Path) -> bool:
-    """Return whether all videos have the same number of frames at the same rate."""
+def have_equal_frames(folder: Path) -> bool:
+    """Return whether all videos have the same number of frames at the same rate, as ingestion demands of cameras
+    without clocks."""
     layout = Uncalibrated(folder)
     footage = [layout.footage(name) for name in cameras_without_calibration(folder)]
-    return len({(one.frames, one.fps and round(one.fps, 2)) for one in footage}) == 1
+    rates = [one.fps for one in footage if one.fps]
+    equal_rates = not rates or max(rates) <= (1 + RATE_TOLERANCE) * min(rates)
+    return equal_rates and len({one.frames for one in footage}) == 1

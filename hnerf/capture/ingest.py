@@ -2,7 +2,6 @@
 
 import logging
 import unicodedata
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, Capture, SubjectPoint
-from hnerf.capture.clocks import Clock, InStep, in_step, warn_if_uneven
+from hnerf.capture.clocks import InStep, in_step, warn_if_uneven
 from hnerf.capture.footage import Footage, Video, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
@@ -46,7 +45,7 @@ from hnerf.capture.safe_io import (
 )
 from hnerf.capture.subset import write_points
 from hnerf.capture.timing import median_step
-from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
+from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration, image_folders_in, videos_in
 from hnerf.capture.video_metadata import is_hdr
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
@@ -140,7 +139,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, layout: Layout | 
         frame_step=median_step(recorded),
         subject_point=_subject_point(manifest, normalisers, wanted),
         stature_m=manifest.stature_m,
-        notes=(*layout.notes(), *_clock_notes(clocks)),
+        notes=tuple(layout.notes()),
         recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
     capture.save()
@@ -153,13 +152,7 @@ def lacks_calibration(folder: Path) -> bool:
     known = any(layout.recognises(folder) for layout in LAYOUTS if layout is not Videos)
     if known or path_in_capture(folder, "calibration", "extrinsic").exists():
         return False
-    return folder.is_dir() and len(cameras_without_calibration(folder)) > 1
-
-
-def _clock_notes(clocks: Mapping[str, Clock]) -> list[str]:
-    """Return what the report says about clocks: nothing without any."""
-    starts = ", ".join(f"{name} {clock.offset_s:+.3f} s" for name, clock in clocks.items())
-    return [f"images are matched by the cameras' clocks, which at one instant show: {starts}"] if clocks else []
+    return folder.is_dir() and len(image_folders_in(folder) or videos_in(folder)) > 1
 
 
 def exported_lenses(folder: Path) -> list[Lens]:
@@ -195,8 +188,8 @@ def recognise(folder: Path) -> Layout:
         )
     if cameras:
         raise InputError(
-            f"{folder}: no calibration of its cameras (extri.yml or another); "
-            f"`hnerf calibrate {folder} --from person` finds them from the person, --from boards from a board"
+            f"{folder}: no calibration of its cameras (extri.yml or another); find them with `hnerf calibrate "
+            f"{folder}` from footage of a board, or with --from person"
         )
     raise InputError(
         f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/Calib*.toml), COLMAP "
@@ -214,7 +207,7 @@ def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
     """
     manifest = read_manifest(folder)
     if isinstance(layout, PeopleSnapshot | Videos | FromPerson) and manifest.up != "z":
-        raise InputError(f"{folder / 'capture.toml'}: up: z is up where the footage makes the world; remove the line")
+        raise InputError(f"{folder / 'capture.toml'}: up: without a calibration, Z is up; remove the line")
     if isinstance(layout, FromPerson) and manifest.metres_per_unit != 1:
         raise InputError(
             f"{folder / 'capture.toml'}: units: cameras found from the person are in metres; remove the line"

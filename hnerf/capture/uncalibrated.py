@@ -14,6 +14,7 @@ from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.pose2sim import lens_from_table
 from hnerf.capture.lens import Lens
+from hnerf.capture.manifest import read_manifest
 from hnerf.capture.safe_io import (
     VIDEO_SUFFIXES,
     by_camera,
@@ -38,13 +39,21 @@ class KnownLens(NamedTuple):
 
 def cameras_without_calibration(folder: Path) -> list[str]:
     """Return the cameras of a folder without camera poses: one for each folder in images/, else for each video in
-    videos/, else for each video in the folder itself; possibly none."""
+    videos/, else for each video in the folder itself; of these, the ones that `capture.toml` names, if it names any.
+    Possibly none."""
+    if folders := image_folders_in(folder):
+        names = [check_camera_name(path.name, path) for path in folders]
+    else:
+        names = list(by_camera(videos_in(folder)))
+    split = read_manifest(folder).cameras
+    return names if split is None else [name for name in names if name in split.train + split.test]
+
+
+def image_folders_in(folder: Path) -> list[Path]:
+    """Return the folders in images/, without hidden ones."""
     images = path_in_capture(folder, "images")
     inside = sorted(images.iterdir()) if images.is_dir() else []
-    folders = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
-    if folders:
-        return [check_camera_name(path.name, path) for path in folders]
-    return list(by_camera(videos_in(folder)))
+    return [path for path in inside if path.is_dir() and not path.name.startswith(".")]
 
 
 def videos_in(folder: Path) -> list[Path]:
@@ -80,9 +89,7 @@ class Uncalibrated(Layout):
         known = {name: KnownLens(lens, f"from {file.name}") for name, lens in given.items() if file and name in names}
         others = [name for name in names if name not in known]
         if self.fov_deg and not others:
-            raise InputError(
-                f"{file}: has the lenses of all cameras; leave out --fov or field_of_view_deg, or the file"
-            )
+            raise InputError(f"{file}: has the lenses of all cameras; remove --fov or field_of_view_deg, or this file")
         return known | {name: lens_by_angle(name, self.footage(name), self.fov_deg) for name in others}
 
     def lenses(self) -> dict[str, Lens]:

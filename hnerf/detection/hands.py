@@ -1,5 +1,5 @@
-"""Hands: 21 points of each of the subject's hands, from the recording's own files, or found by MediaPipe's hand network
-(Zhang et al. 2020) where the forearm ends."""
+"""Hands: 21 points of each of the subject's hands, given by the recording's files or the user's own keypoint network,
+or found by MediaPipe's hand network (Zhang et al. 2020) where the forearm ends."""
 
 import logging
 import math
@@ -41,15 +41,15 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
     """Write the capture into `out` with the subject's hands in its training cameras; return the share of hands found by
     camera.
 
-    The network, if it is installed, searches the cameras whose own files do not have the subject's hands in most frames
-    that show the subject. Test cameras are never read. Raises InputError if the network is altered or there is no
+    The network, if it is installed, searches the cameras in which hands are not given for most frames that show the
+    subject. Test cameras are never read. Raises InputError if the network is altered or there is no
     subject.
     """
     people = subject_keypoints(capture)
     hands = {name: given_hands(capture, name, keypoints) for name, keypoints in people.items()}
     own = [name for name, keypoints in people.items() if _in_most_frames(hands[name], keypoints)]
     if own:
-        log.info("hands: from the recording's own files in %s", ", ".join(own))
+        log.info("hands: given in %s", ", ".join(own))
     if len(own) < len(people) and has_model(HAND_LANDMARKS):
         hands |= _search(capture, {name: people[name] for name in people if name not in own})
     copy_folder(capture.root, out)
@@ -58,8 +58,7 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
 
 
 def given_hands(capture: Capture, camera: str, subject: np.ndarray) -> np.ndarray:
-    """Return the hands (frames, 2, 21, 3) that the recording's own files have of the subject, keypoints (frames, 25,
-    3); 0 where they have none."""
+    """Return the given hands (frames, 2, 21, 3) of the subject, keypoints (frames, 25, 3); 0 where there are none."""
     hands = np.zeros((len(subject), 2, POINTS, 3))
     given, people = capture.given_hands(camera), capture.keypoints(camera)
     if given is None or people is None:

@@ -34,7 +34,7 @@ def write_result(path: Path, kind: Any, result: Any) -> None:
     """Write a result as JSON. Raise ValidationError if it has a key that its kind does not define, or a value of
     another type."""
     _closed(kind).validate_python(result)
-    path.write_text(json.dumps(result, indent=1))
+    path.write_text(json.dumps(result, indent=1, allow_nan=False))
 
 
 def write_schemas(folder: Path) -> None:

@@ -13,7 +13,8 @@ from flows.preparation import ingest_recording
 from hnerf.calibration import find_cameras as module
 from hnerf.calibration.bundle import align
 from hnerf.calibration.clocks.estimate import Clocks
-from hnerf.calibration.find_cameras import find_cameras
+from hnerf.calibration.clocks.recording import UndeterminedClocksError
+from hnerf.calibration.find_cameras import find_missing_cameras, have_equal_frames
 from hnerf.calibration.person.recording import calibrate_recording
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
@@ -31,16 +32,15 @@ from tests.calibration.synthetic import detections, ring
 from tests.capture.recordings import write_video
 
 CLOCKS = {"a": Clock(0.0), "b": Clock(1.25, 1.0001)}
-MOVES_TOO_LITTLE = InputError("film: no start offset is clearly better")
+MOVES_TOO_LITTLE = UndeterminedClocksError("film: no start offset is clearly better")
 
 
 @pytest.fixture
 def calibrated_with(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Replace calibration by a fake, and return the clocks that it gets."""
-    clocks: list[Any] = []
-    found = Mock(notes=lambda: [])
-    monkeypatch.setattr(module, "calibrate_recording", lambda _, **options: clocks.append(options["clocks"]) or found)
-    return clocks
+    given, found = list[Any](), Mock()
+    monkeypatch.setattr(module, "calibrate_recording", lambda _, clocks: given.append(clocks) or found)
+    return given
 
 
 def film(folder: Path, *frames: int) -> Path:
@@ -53,7 +53,9 @@ def test_a_recording_without_calibration_is_ingested_with_cameras_from_the_perso
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Images of the same number are simultaneous: no clocks are looked for."""
-    monkeypatch.setattr("tasks.cage.run_caged", in_this_process)
+    caged = Mock(side_effect=in_this_process)
+    monkeypatch.setattr("tasks.cage.run_caged", caged)
+    monkeypatch.setattr(module, "synchronise_recording", Mock(side_effect=AssertionError))
     monkeypatch.setattr(Outlines, "of", lambda *_: None)
     truth = ring(3)
     seen = {camera.name: found for camera, found in zip(truth, detections(truth, 1.0), strict=True)}
@@ -67,7 +69,8 @@ def test_a_recording_without_calibration_is_ingested_with_cameras_from_the_perso
     assert capture.notes[0].startswith(
         "no calibration, so cameras were found from the person; scale: a person of 1.80 m"
     )
-    assert len(capture.notes) == 1
+    assert capture.notes[1:] == ("cameras are taken to be in step",)
+    assert caged.call_count == 2  # cameras, capture
     made = {path.name for path in (tmp_path / "store" / "cameras").glob("*/*")}
     assert made == {"intri.yml", "extri.yml", "report.json"}
 
@@ -76,7 +79,7 @@ def test_clocks_of_videos_are_found_and_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calibrated_with: list[Any]
 ) -> None:
     monkeypatch.setattr(module, "synchronise_recording", lambda _: (Clocks(CLOCKS, {}, {}), {}))
-    find_cameras(film(tmp_path / "film", 3, 4), tmp_path / "out")
+    find_missing_cameras(film(tmp_path / "film", 3, 4), tmp_path / "out")
     assert calibrated_with == [CLOCKS] and read_clocks(tmp_path / "out") == CLOCKS
 
 
@@ -86,7 +89,7 @@ def test_clocks_in_the_folder_are_used(
     monkeypatch.setattr(module, "synchronise_recording", Mock(side_effect=AssertionError))
     folder = film(tmp_path / "film", 3, 4)
     (folder / "clocks.toml").write_text("[a]\n[b]\noffset_s = 0.04\n")
-    find_cameras(folder, tmp_path / "out")
+    find_missing_cameras(folder, tmp_path / "out")
     assert calibrated_with == [{"a": Clock(), "b": Clock(0.04)}] == [read_clocks(tmp_path / "out")]
 
 
@@ -98,11 +101,11 @@ def test_if_clocks_cannot_be_found_videos_with_the_same_frames_are_in_step(
 ) -> None:
     monkeypatch.setattr(module, "synchronise_recording", Mock(side_effect=MOVES_TOO_LITTLE))
     with caplog.at_level(logging.WARNING):
-        find_cameras(film(tmp_path / "film", 3, 3), tmp_path / "out")
+        find_missing_cameras(film(tmp_path / "film", 3, 3), tmp_path / "out")
     assert calibrated_with == [{}] and not (tmp_path / "out" / "clocks.toml").exists()
     assert "no start offset is clearly better; cameras are taken to be in step" in caplog.text
     with pytest.raises(InputError, match=r"clearly better; or state the clocks in clocks\.toml"):
-        find_cameras(film(tmp_path / "other", 3, 4), tmp_path / "out")
+        find_missing_cameras(film(tmp_path / "other", 3, 4), tmp_path / "out")
 
 
 def test_the_calibration_sees_the_videos_in_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,8 +129,41 @@ def test_the_capture_is_ingested_in_step_by_the_clocks_that_were_found(tmp_path:
     (found / "report.json").write_text('{"notes": ["scale: 1 %"]}')
     capture = ingest(folder, CaptureSettings(), tmp_path / "out", FromPerson(folder, found))
     assert capture.frames == tuple(range(7))
-    assert (
-        capture.notes[1]
-        == "images are matched by the cameras' clocks, which at one instant show: a +0.000 s, b +0.080 s"
-    )
+    assert capture.notes[1] == "images are matched by these clocks: a +0.000 s, b +0.080 s"
     assert Capture.load(tmp_path / "out").notes == capture.notes
+
+
+def test_other_faults_are_not_taken_for_undetermined_clocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calibrated_with: list[Any]
+) -> None:
+    monkeypatch.setattr(module, "synchronise_recording", Mock(side_effect=InputError("b.mp4: cannot be decoded")))
+    with pytest.raises(InputError, match=r"^b\.mp4: cannot be decoded$"):
+        find_missing_cameras(film(tmp_path / "film", 3, 3), tmp_path / "out")
+    assert not calibrated_with
+
+
+def test_a_point_in_a_video_needs_clocks(tmp_path: Path, calibrated_with: list[Any]) -> None:
+    """The same frame number would be the camera's own at first, and later an instant of the slowest camera."""
+    folder = film(tmp_path / "film", 8, 9)
+    (folder / "capture.toml").write_text('subject = "nearest to (5, 5) in b at frame 3"\n')
+    with pytest.raises(InputError, match=r"capture\.toml: subject: .* run `hnerf synchronise"):
+        find_missing_cameras(folder, tmp_path / "out")
+    (folder / "clocks.toml").write_text("[a]\n[b]\n")
+    find_missing_cameras(folder, tmp_path / "out")
+    assert calibrated_with == [{"a": Clock(), "b": Clock()}]
+
+
+def test_ground_truth_is_refused_without_a_calibration(tmp_path: Path) -> None:
+    folder = film(tmp_path / "film", 3, 3)
+    (folder / "ground_truth").mkdir()
+    source, _ = read_capture(folder)
+    with pytest.raises(InputError, match="ground_truth: of no use without a calibration"):
+        ingest_recording(Store(tmp_path / "store"), source, load_settings("fast"))
+
+
+def test_frame_rates_that_ingestion_takes_for_equal_are_equal(tmp_path: Path) -> None:
+    for name, fps in (("a", 29.97), ("b", 30.0)):
+        write_video(tmp_path / f"{name}.mp4", 3, fps=fps)
+    assert have_equal_frames(tmp_path)
+    write_video(tmp_path / "b.mp4", 3, fps=31)
+    assert not have_equal_frames(tmp_path)

@@ -195,9 +195,11 @@ def test_board_footage_is_not_read_without_calibration(tmp_path: Path) -> None:
 
 
 def test_which_folders_lack_a_calibration(tmp_path: Path) -> None:
-    """Several cameras without calibration do; one video, other layouts, and cameras that a board shows do not."""
+    """Several cameras without calibration do; one video, other layouts, and cameras that a board shows do not. A phone
+    may have named the video as no camera can be named."""
     for name in ("one", "two", "boards"):
         write_video(tmp_path / name / "a.mp4", 2)
+    (tmp_path / "one" / "a.mp4").rename(tmp_path / "one" / "VID 2024-01-01 at 10.00.00.mp4")
     for name in ("two", "boards"):
         write_video(tmp_path / name / "b.mp4", 2)
     write_images(tmp_path / "images", "a")
@@ -205,7 +207,7 @@ def test_which_folders_lack_a_calibration(tmp_path: Path) -> None:
     (tmp_path / "boards" / "calibration" / "extrinsic").mkdir(parents=True)
     write_easymocap(tmp_path / "calibrated")
     assert {path.name for path in tmp_path.iterdir() if lacks_calibration(path)} == {"two", "images"}
-    assert not lacks_calibration(tmp_path / "one" / "a.mp4")
+    assert not lacks_calibration(tmp_path / "two" / "a.mp4")
 
 
 @pytest.mark.parametrize("line", ['up = "y"', 'units = "mm"'])
@@ -215,3 +217,10 @@ def test_the_world_of_cameras_found_from_the_person_is_not_stated(tmp_path: Path
     (folder / "capture.toml").write_text(line)
     with pytest.raises(InputError, match=r"capture\.toml: (up|units): .*; remove the line"):
         ingest(folder, CaptureSettings(), tmp_path / "out", FromPerson(folder, folder))
+
+
+def test_only_the_cameras_that_are_named_are_used(tmp_path: Path) -> None:
+    for camera in "abc":
+        write_images(tmp_path, camera)
+    (tmp_path / "capture.toml").write_text('[cameras]\ntrain = ["a"]\ntest = ["c"]\n')
+    assert cameras_without_calibration(tmp_path) == ["a", "c"]

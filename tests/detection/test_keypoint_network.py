@@ -166,11 +166,17 @@ def test_its_keypoints_replace_those_of_blazepose(recording: Capture, tmp_path: 
 
 
 def test_its_hands_are_those_of_the_people(recording: Capture, tmp_path: Path) -> None:
-    """Of the 133 points, the last 42 are the left and the right hand's; all lie where the one above does."""
-    model = write_network(tmp_path / "n.onnx", *simcc(133, 7, 14, 0.6))
+    """Of the 133 points, the last 42 are the left and the right hand's. All but the right hand's lie where the one
+    above does; the right hand is 1 px of the network to the right."""
+    across, down = simcc(133, 7, 14, 0.6)
+    across[:, 112:] = np.roll(across[:, 112:], 2, axis=-1)
+    model = write_network(tmp_path / "n.onnx", across, down)
     detect(recording, DetectionSettings(source="network", model=model), tmp_path / "out")
     hands, scale = Capture.load(tmp_path / "out").given_hands("01"), 25 * 1.25 / 12
-    np.testing.assert_allclose(hands, np.tile([17.5 - 2 * scale, 4 - 0.5 * scale, 0.6], (5, 1, 2, 21, 1)))
+    assert hands is not None and hands.shape == (5, 1, 2, 21, 3)
+    for hand, right in enumerate((0, scale)):
+        expected = np.tile([17.5 - 2 * scale + right, 4 - 0.5 * scale, 0.6], (5, 1, 21, 1))
+        np.testing.assert_allclose(hands[:, :, hand], expected)
 
 
 def test_a_network_that_is_sure_of_nothing_finds_nobody(recording: Capture, tmp_path: Path) -> None:

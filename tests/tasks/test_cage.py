@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,10 @@ def crashes(folder: Path) -> None:
 def wants_all_memory(folder: Path) -> None:
     read_first(folder)
     bytearray(3 << 29)
+
+
+def loses_a_process(folder: Path) -> None:
+    raise BrokenProcessPool("terminated abruptly")
 
 
 def never_ends(folder: Path) -> None:
@@ -134,7 +139,7 @@ def test_logs_progress_output_and_files_of_a_reader_arrive(
     [
         (crashes, r"first.bin: reading it crashed \(SIGSEGV\); export it again"),
         (wants_all_memory, "first.bin: reading it needs more than 1 GiB; export it again, or raise limits.reader_gib"),
-        (never_ends, "first.bin: no progress in 0 s of a processor's time; export it again"),
+        (never_ends, "first.bin: no progress in 0 s of a processor's time; export it again, or raise limits.stage_s"),
         (writes_without_end, "first.bin: what is written of it is too large; export it again"),
         (opens_everything, "first.bin: it needs too many open files; export it again"),
         (refuses, "no calibration; give one"),
@@ -196,3 +201,8 @@ def test_a_reader_ends_with_its_run(tmp_path: Path) -> None:
             return
         time.sleep(0.05)
     pytest.fail("the reader outlived its run")
+
+
+def test_a_reader_that_loses_a_process_of_its_own_is_retryable(tmp_path: Path) -> None:
+    with pytest.raises(LostWorkerError, match="a process of its reader ended: terminated abruptly"):
+        run_caged(loses_a_process, tmp_path, folder=tmp_path)

@@ -24,12 +24,16 @@ from hnerf.geometry.camera import Camera
 MAX_FRAMES = 20_000  # of a camera: eleven minutes at 30 frames a second; of more, every second or third is used
 
 
+class UndeterminedClocksError(InputError):
+    """The person's motion does not determine the clocks of recordings that can be read."""
+
+
 def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
     """Return the clocks of the cameras in a folder, and per camera their source, in words.
 
     Each camera is read separately, with its own frames and times. If the folder has a calibration, the cameras'
-    geometry distinguishes offsets that would otherwise look alike. Raises InputError if the recordings do not determine
-    the clocks, or are not of the calibrated size.
+    geometry distinguishes offsets that would otherwise look alike. Raises UndeterminedClocksError, and InputError if
+    the recordings cannot be read or are not of the calibrated size.
     """
     names = cameras_without_calibration(folder)
     if not names:
@@ -54,7 +58,7 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
     try:
         return estimate_clocks(tracks, cameras or None, near_s), sources
     except InputError as error:
-        raise InputError(f"{folder}: {error}") from None
+        raise UndeterminedClocksError(f"{folder}: {error}") from None
 
 
 def _track(alone: Uncalibrated, name: str, fps: float, lens: Lens | None, scratch: Path) -> Track:

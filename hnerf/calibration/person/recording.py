@@ -8,6 +8,7 @@ from pathlib import Path
 from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
 from hnerf.capture.clocks import Clock
 from hnerf.capture.ingest import ingest
+from hnerf.capture.manifest import read_manifest
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
 from hnerf.detection.detect import with_keypoints
@@ -24,11 +25,12 @@ def calibrate_recording(
     """Calibrate the cameras of a recording from its own keypoints, or from the network's if it has none.
 
     An existing calibration of the folder is not read, except for intrinsics in its `intri.yml` that no earlier
-    calibration from the person estimated. clocks: used instead of those in the folder. Raises InputError if the
-    recording cannot be read or does not determine the cameras.
+    calibration from the person estimated. fov_deg: None for that of `capture.toml`; clocks: used instead of those in
+    the folder. Raises InputError if the recording cannot be read or does not determine the cameras.
     """
     if not cameras_without_calibration(folder):
         raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to calibrate from; add the recordings")
+    fov_deg = fov_deg or read_manifest(folder).field_of_view_deg
     layout = Uncalibrated(folder, lens_file, fov_deg, found_clocks=clocks)
     with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
         capture = ingest(folder, CaptureSettings(), Path(scratch) / "capture", layout)

@@ -25,6 +25,8 @@ class FromPerson(EasyMocap):
         return read_clocks(self.found)
 
     def notes(self) -> list[str]:
-        """Return how certain scale and vertical axis are."""
+        """Return how certain scale and vertical axis are, and when the cameras started."""
         report = json.loads((self.found / "report.json").read_text())
-        return [f"no calibration, so cameras were found from the person; {'; '.join(report['notes'])}"]
+        starts = ", ".join(f"{name} {clock.offset_s:+.3f} s" for name, clock in self.clocks().items())
+        clocks = f"images are matched by these clocks: {starts}" if starts else "cameras are taken to be in step"
+        return [f"no calibration, so cameras were found from the person; {'; '.join(report['notes'])}", clocks]

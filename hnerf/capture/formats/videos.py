@@ -38,8 +38,8 @@ class Videos(EasyMocap):
         videos = _videos(self.folder)
         if len(videos) > 1:
             raise InputError(
-                f"{self.folder}: {len(videos)} videos without calibration; `hnerf calibrate {self.folder} --from "
-                "person` finds their cameras from the person, --from boards from footage of a board"
+                f"{self.folder}: {len(videos)} videos without calibration; find their cameras with `hnerf "
+                f"calibrate {self.folder}` from footage of a board, or with --from person"
             )
         name, file = _camera_name(videos[0]), self.folder / "intri.yml"
         if self.folder.is_dir() and path_in_capture(self.folder, file.name).exists():

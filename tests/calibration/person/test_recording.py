@@ -80,7 +80,7 @@ def test_a_field_of_view_is_refused_if_all_lenses_are_known(tmp_path: Path) -> N
     """If calibrated cameras were copied into the folder, their lenses would be used instead."""
     folder = write_recording(tmp_path / "film", {"c0": np.ones((1, 25, 3)), "c1": np.ones((1, 25, 3))})
     write_easymocap(folder, [pinhole(camera) for camera in ring(2)])
-    with pytest.raises(InputError, match=r"intri\.yml: has the lenses of all cameras; leave out --fov"):
+    with pytest.raises(InputError, match=r"intri\.yml: has the lenses of all cameras; remove --fov"):
         _ = Uncalibrated(folder, fov_deg=60.0).known_lenses
     write_easymocap(folder, [pinhole(camera) for camera in ring(1)])
     assert Uncalibrated(folder, fov_deg=60.0).known_lenses["c1"].source == "60 degrees given"

@@ -78,7 +78,7 @@ def test_the_world_of_one_camera_has_z_up(tmp_path: Path) -> None:
     write_video(tmp_path / "ada" / "front.mp4", 3)
     (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')
     message = rec.refusal(tmp_path / "ada", tmp_path / "out")
-    assert "capture.toml: up: z is up where the footage makes the world; remove the line" in message
+    assert "capture.toml: up: without a calibration, Z is up; remove the line" in message
 
 
 def test_known_data_of_a_single_video_are_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -110,7 +110,7 @@ def test_several_videos_need_cameras(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_video(tmp_path / "ada" / f"{name}.mp4", 3)
     (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')  # applies once there are cameras
-    assert "--from person` finds their cameras" in rec.refusal(tmp_path / "ada", tmp_path / "out")
+    assert "footage of a board, or with --from person" in rec.refusal(tmp_path / "ada", tmp_path / "out")
 
 
 def test_videos_next_to_their_calibration_are_read(tmp_path: Path) -> None:
