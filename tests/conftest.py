@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from hnerf.body.rig import Rig
     from hnerf.capture.capture import Capture
 
-SHAPED = ["geometry.camera", "geometry.reach", "geometry.triangulation", "fields.compositing", "fields.encoding"]
-SHAPED += ["fields.samples", "training.losses"]
+# Modules with warp kernels cannot be among them: beartype does not know warp's types.
+SHAPED = ("geometry.camera", "geometry.reach", "geometry.triangulation", "body.canonical", "body.rig", "body.t_pose",
+          "fields.compositing", "fields.encoding", "fields.samples", "training.losses")  # fmt: skip
 install_import_hook([f"hnerf.{name}" for name in SHAPED], "beartype.beartype")
 
 # Prefect reads its settings when it is imported.

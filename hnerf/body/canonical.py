@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
@@ -269,12 +270,14 @@ class PosedBodies:
             parameter.zero_()
 
 
-def nearest_corner(corners: Tensor, barycentric: Tensor) -> Tensor:
+def nearest_corner(corners: Int[Tensor, "N K"], barycentric: Float[Tensor, "N K"]) -> Int[Tensor, " N"]:
     """Return which of the corners (N, 3) has the greatest barycentric weight, (N,)."""
     return corners.gather(1, barycentric.argmax(1, keepdim=True))[:, 0]
 
 
-def weighted_sum(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
+def weighted_sum(
+    values: Float[Tensor, "V D"], corners: Int[Tensor, "N K"], barycentric: Float[Tensor, "N K"]
+) -> Float[Tensor, "N D"]:
     """Return weighted sums (N, D) of rows of values (V, D): corners (N, K) name the rows, barycentric (N, K) their
     weights. One pass; gradients flow to the values only."""
     return _WeightedSum.apply(values, corners, barycentric.to(values))
@@ -298,7 +301,7 @@ class _WeightedSum(torch.autograd.Function):
         return total, None, None
 
 
-def distinct_rows(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def distinct_rows(rows: Int[Tensor, " N"], count: int) -> tuple[Int[Tensor, " K"], Int[Tensor, " N"]]:
     """Return which of `count` rows occur among `rows` (N,), and the position of each of `rows` among those, (N,);
     without sorting."""
     occurs = torch.zeros(count, dtype=torch.bool, device=rows.device)
@@ -306,7 +309,7 @@ def distinct_rows(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return occurs.nonzero()[:, 0], (occurs.cumsum(0) - 1)[rows]
 
 
-def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
+def axis_angle_from_rotation(rotation: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
     """Return the axis-angle (..., 3) in radians of rotations (..., 3, 3), at most a half turn; without a gradient."""
     turns = Rotation.from_matrix(rotation.detach().cpu().double().reshape(-1, 3, 3).numpy()).as_rotvec()
     return torch.from_numpy(turns).to(rotation).view(rotation.shape[:-1])

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from hnerf.body.limbs import Limbs
@@ -123,7 +124,7 @@ def _require_agreement(arrays: Mapping[str, np.ndarray]) -> None:
             raise ValueError(f"{name} has an index beyond {sizes[counted]}")
 
 
-def shortest_rotation(a: Tensor, b: Tensor) -> Tensor:
+def shortest_rotation(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """Return the rotation (3, 3) of direction a into b, which is not opposite, about their common normal
     (Rodrigues)."""
     a, b = a / a.norm(), b / b.norm()
@@ -131,7 +132,7 @@ def shortest_rotation(a: Tensor, b: Tensor) -> Tensor:
     return torch.eye(3, dtype=a.dtype) + cross + cross @ cross / (1 + a @ b)
 
 
-def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
+def rotation_from_axis_angle(axis_angle: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
     """Return rotations (..., 3, 3) of axis-angle (..., 3) in radians, by Rodrigues' formula with finite gradients at
     zero."""
     angle_squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
@@ -144,14 +145,16 @@ def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
     return torch.eye(3, dtype=cross.dtype, device=cross.device) + sinc * cross + half * (cross @ cross)
 
 
-def cross_matrix(vectors: Tensor) -> Tensor:
+def cross_matrix(vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
     """Return the matrices [v] (..., 3, 3) of vectors v (..., 3), for which [v] w is v x w."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
-def joint_transforms(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
+def joint_transforms(
+    rig: Rig, theta: Float[Tensor, "*n J 3"], root: Float[Tensor, "*n 4 4"]
+) -> Float[Tensor, "*n J 4 4"]:
     """Return the world transform of every joint, (..., J, 4, 4).
 
     theta (..., J, 3) radians; root (..., 4, 4) world from body (T in docs/method.md).
@@ -164,7 +167,9 @@ def joint_transforms(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
     return _along_chain(rig, first, lambda above, joints: above @ own[..., joints, :, :])
 
 
-def posed_joint_basis(rig: Rig, world: Tensor, root: Tensor) -> Tensor:
+def posed_joint_basis(
+    rig: Rig, world: Float[Tensor, "n J 4 4"], root: Float[Tensor, "n 4 4"]
+) -> Float[Tensor, "n J 3 B"]:
     """Return how a unit of each shape value moves the posed joints, (n, J, 3, B) metres. world (n, J, 4, 4):
     `joint_transforms`; root (n, 4, 4)."""
     offsets = _relative_to_parent(rig, rig.joint_basis.transpose(0, 1)).transpose(1, 2)  # (J, 3, B)
@@ -173,25 +178,27 @@ def posed_joint_basis(rig: Rig, world: Tensor, root: Tensor) -> Tensor:
     return _along_chain(rig, first, lambda above, joints: above + turned[:, joints])
 
 
-def skinning_transforms(world: Tensor, joints_m: Tensor) -> Tensor:
+def skinning_transforms(world: Float[Tensor, "*n J 4 4"], joints_m: Float[Tensor, "J 3"]) -> Float[Tensor, "*n J 4 4"]:
     """Return world from rest pose for a point rigidly attached to each joint, (..., J, 4, 4): G_j [I | -joint_j].
     world: G, of `joint_transforms`; joints_m (J, 3) at rest."""
     moved = world[..., :3, 3] - (world[..., :3, :3] @ joints_m[..., None])[..., 0]
     return torch.cat([torch.cat([world[..., :3, :3], moved[..., None]], -1), world[..., 3:, :]], -2)
 
 
-def pose_vertices(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
+def pose_vertices(rig: Rig, theta: Float[Tensor, "*n J 3"], root: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n V 3"]:
     """Return posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4)."""
     transforms = vertex_skinning(rig, theta, root)
     return (transforms[..., :3, :3] @ rig.vertices_m[..., None])[..., 0] + transforms[..., :3, 3]
 
 
-def vertex_skinning(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
+def vertex_skinning(
+    rig: Rig, theta: Float[Tensor, "*n J 3"], root: Float[Tensor, "*n 4 4"]
+) -> Float[Tensor, "*n V 3 4"]:
     """Return world from rest pose for every vertex, (..., V, 3, 4). theta (..., J, 3), root (..., 4, 4)."""
     return vertex_transforms(rig, skinning_transforms(joint_transforms(rig, theta, root), rig.joints_m))
 
 
-def vertex_transforms(rig: Rig, transforms: Tensor) -> Tensor:
+def vertex_transforms(rig: Rig, transforms: Float[Tensor, "*n J 4 4"]) -> Float[Tensor, "*n V 3 4"]:
     """Blend joint transforms (..., J, 4, 4) by skin weights: (..., V, 3, 4), world from rest pose."""
     top = transforms[..., :3, :].flatten(-2)  # (..., J, 12)
     return (rig.dense_weights @ top).unflatten(-1, (3, 4))

@@ -1,6 +1,7 @@
 """The T pose of a rig, in which other programs compare skeletons."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from hnerf.body.canonical import axis_angle_from_rotation
@@ -17,7 +18,7 @@ BONES = {
 }
 
 
-def t_pose(rig: Rig) -> Tensor:
+def t_pose(rig: Rig) -> Float[Tensor, "J 3"]:
     """Return theta (J, 3) with arms and hands straight out to the sides, palms as they turn with them, and legs
     straight down. Bones take the shortest rotation; feet, trunk and head keep their directions, fingers stay at rest.
     """
