@@ -360,6 +360,7 @@ def test_colour_gradients_by_the_body_position_match_finite_differences():
     """The gradients of a slanted ray's colour match central differences over 0.2 mm."""
     bodies, conditions = standing()
     field, correction = field_of(500.0), bodies.correction()
+    del correction.move_m  # a plain tensor takes the parameter's place
     for grid in field.field.colour_grids.parameters():
         torch.nn.init.normal_(grid)
     direction = torch.nn.functional.normalize(torch.tensor([[0.4, 0.3, -1.0]]), dim=-1)
@@ -367,8 +368,8 @@ def test_colour_gradients_by_the_body_position_match_finite_differences():
     draws = Draws.deterministic(1, SETTINGS.samples, torch.device("cpu"))
 
     def colour(move_m: torch.Tensor) -> torch.Tensor:
-        moved = {"move_m": move_m[None], "turn": correction.turn, "shape": correction.shape}
-        scene = PosedScene(bodies, field.region(bodies, conditions), conditions, SimpleNamespace(**moved))
+        correction.move_m = move_m[None]
+        scene = PosedScene(bodies, field.region(bodies, conditions), conditions, correction)
         samples, _ = field.sample(scene, rays, draws)
         return pixel_colour(samples.alpha, samples)[0]
 
