@@ -48,10 +48,10 @@ class Distance(TypedDict):
 
 
 class Light(TypedDict):
-    """The estimated light. coefficients: spherical harmonics up to order 2, RGB; normals_turned_deg: by how much the
-    person's turning tells light from albedo."""
+    """The estimated light. coefficients (9,): of spherical harmonics up to order 2; normals_turned_deg: root mean
+    square angle by which the normals of single points turned."""
 
-    coefficients: list[Any]
+    coefficients: list[float]
     normals_turned_deg: float
 
 
