@@ -7,16 +7,17 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hnerf.avatar.finished import avatar_of, reason_without_novel_poses
+from hnerf.avatar.finished import avatar_of, reason_without_novel_poses, require_poses
 from hnerf.body.rig import Rig
 from hnerf.capture.capture import Capture
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.render.live import LivePerson, Pace, Shown, browser_camera, field_of_view_rad
+from hnerf.render.pictures import frame_times
 from hnerf.render.subject import RenderOptions, checked_capture, chosen_motion
 
 if TYPE_CHECKING:
@@ -48,7 +49,9 @@ def view_subject(subject: Path, motions: Sequence[Path], host: str, port: int) -
 
 def live_person(subject: Path, motions: Sequence[Path], capture: Capture) -> LivePerson:
     """Return the subject's avatar in its captured motion and in others, each called by its file's name. Raises
-    InputError if two have the same name."""
+    InputError if two have the same name, or if the method cannot show other motions."""
+    if motions:
+        require_poses(subject, "another motion")
     options = {CAPTURED: RenderOptions()} | {path.name: RenderOptions(motion=path) for path in motions}
     if len(options) <= len(motions):
         names = ", ".join(path.name for path in motions)
@@ -98,7 +101,7 @@ class Page:
         gui.add_button("Reset joints and shape").on_click(lambda _: self._reset())
         self._joint.on_update(lambda _: self._show_turn())
         for slider in self._turn:
-            slider.on_update(lambda _: self._set_turn())
+            slider.on_update(self._set_turn)
         for slider in self._shape.values():
             slider.on_update(lambda _: self._change())
 
@@ -146,7 +149,9 @@ class Page:
         for slider, turn_deg in zip(self._turn, self._turns_deg.get(self._joint.value, (0.0, 0.0, 0.0)), strict=True):
             slider.value = turn_deg
 
-    def _set_turn(self) -> None:
+    def _set_turn(self, event: "viser.GuiEvent[Any]") -> None:
+        if event.client_id is None:  # not moved by hand, but by `_show_turn` or `_reset`, one after another
+            return
         x, y, z = (slider.value for slider in self._turn)
         self._turns_deg[self._joint.value] = x, y, z
         self._change()
@@ -154,7 +159,8 @@ class Page:
     def _reset(self) -> None:
         self._turns_deg.clear()
         for slider in [*self._turn, *self._shape.values()]:
-            slider.value = 0.0  # as if by hand: changes call what listens to them
+            slider.value = 0.0
+        self._change()
 
     def _look_through(self, client: "viser.ClientHandle | None", name: str) -> None:
         """Move a browser's camera to a recorded one."""
@@ -200,7 +206,10 @@ class Page:
         self._note.content = note
 
     def _advance(self) -> None:
-        """While Play is checked, show each pose when its time has come."""
-        while not self._closed.wait(1 / (motion := self._person.motions[self._motion.value]).fps):
-            if self._play.value:
-                self._frame.value = (self._frame.value + 1) % len(motion.body.frames)
+        """While Play is checked, show each pose for as long as the videos of `hnerf render` do."""
+        while not self._closed.is_set():
+            motion, row = self._person.motions[self._motion.value], self._frame.value
+            rate, lasts = frame_times(motion.body.frames, motion.fps)
+            self._closed.wait(lasts[min(row, len(lasts) - 1)] / rate)
+            if self._play.value and self._frame.value == row:  # not moved by hand meanwhile
+                self._frame.value = (row + 1) % len(lasts)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -97,14 +98,51 @@ def test_play_shows_one_pose_after_another(page: Page) -> None:
     browser.wait(lambda: poses.add(page.shown().frame) or poses == {0, 1, 2})  # type: ignore[func-returns-value]
 
 
+def test_play_takes_as_long_as_the_recording(page: Page) -> None:
+    """Frames 0, 5 and 10 of a recording of 25 frames a second are shown for 0.2 s each."""
+    motion = page._person.motions["captured"]
+    sparse = dataclasses.replace(motion, body=dataclasses.replace(motion.body, frames=(0, 5, 10)), fps=25.0)
+    waits_s = list[float]()
+
+    class Clock:
+        """Ends after four waits."""
+
+        def is_set(self) -> bool:
+            return len(waits_s) == 4
+
+        def wait(self, seconds: float) -> None:
+            waits_s.append(seconds)
+
+    slow = SimpleNamespace(
+        _closed=Clock(), _person=SimpleNamespace(motions={"captured": sparse}),
+        _motion=SimpleNamespace(value="captured"), _frame=SimpleNamespace(value=0), _play=SimpleNamespace(value=True),
+    )  # fmt: skip
+    Page._advance(slow)  # type: ignore[arg-type]
+    assert waits_s == pytest.approx([0.2, 0.2, 0.2, 0.2])
+    assert slow._frame.value == 1
+
+
 def test_a_turn_belongs_to_its_joint_and_is_reset(page: Page) -> None:
+    by_hand = SimpleNamespace(client_id=7)
     page._turn[1].value = 30
-    page._set_turn()
-    (joint,) = page.shown().turns_deg
-    assert page.shown().turns_deg == {joint: (0, 30, 0)}
+    page._set_turn(by_hand)  # type: ignore[arg-type]
+    (first,) = page.shown().turns_deg
+    assert page.shown().turns_deg == {first: (0, 30, 0)}
+    page._turn[0].value = 5  # as when the sliders move to another joint's turn, one after another
+    assert page.shown().turns_deg == {first: (0, 30, 0)}
+
     page._reset()
     assert not page.shown().turns_deg
     assert [slider.value for slider in page._turn] == [0, 0, 0]
+
+
+def test_a_reset_is_shown_even_if_no_slider_moves(page: Page) -> None:
+    """Another joint is turned than the one whose sliders are shown."""
+    page._turns_deg["another"] = (0, 30, 0)
+    changed = page._changed[7] = threading.Event()
+    page._reset()
+    assert changed.is_set()
+    assert not page.shown().turns_deg
 
 
 def test_a_motion_of_another_subject_is_offered(page: Page, subject: Path) -> None:
