@@ -4,7 +4,7 @@ usage: python benchmarks/budget.py STORE OUT [CAPTURE ...] [--preset NAME] [--at
 
 Trains shared captures (default: the three rendered ones), whose stages up to the body fit are in STORE, with the
 settings that hnerf/training/auto_settings.py chooses, three times with different seeds; then with twice and half of one
-setting at a time: cells of the grids, samples a ray, nodes, width of the pose code and of the layers, rays a step,
+setting at a time: cells of the grids, spacing of samples, nodes, width of the pose code and of the layers, rays a step,
 steps, and steps on novel frames. Scores a few held-out images by the evaluation protocol. Training and scoring are
 those of the pipeline's stages, without Prefect. Reuses what is in OUT. Writes `benchmarks/results/budget.json` and
 `.md`, where other captures keep their results.
@@ -38,7 +38,7 @@ DECIDED = "as decided"
 SEEDS = (1, 2)  # besides the first, 0
 PARTS = {
     "cells": ("field.geometry_cells", "field.colour_cells"),
-    "samples": ("field.samples",),
+    "spacing": ("field.spacing_m",),
     "nodes": ("field.nodes",),
     "pose code": ("field.pose_width",),
     "layer width": ("field.width",),
@@ -137,9 +137,12 @@ def scaled(training: TrainingSettings, keys: tuple[str, ...], factor: float) -> 
     decided, side, changes = training.model_dump(), float(np.cbrt(factor)), []
     for key in keys:
         value = pick(decided, key)
-        cells = isinstance(value, tuple)
-        # Settings that are 0 would be chosen from the scene.
-        changed = [round(side * n) for n in value] if cells else max(round(factor * value), min(value, 1))
+        if isinstance(value, tuple):
+            changed: Any = [round(side * n) for n in value]
+        elif isinstance(value, float):
+            changed = factor * value
+        else:
+            changed = max(round(factor * value), min(value, 1))  # settings that are 0 would be chosen from the scene
         changes.append(f"{key}={changed}")
     return overridden(training, changes)
 

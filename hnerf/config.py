@@ -138,7 +138,7 @@ class FastFieldSettings(FieldSettings):
     outer_m: float = Field(default=0.0, ge=0)  # thickness of the shell outside the body; 0: chosen from the scene
     inner_m: float = Field(default=0.0, ge=0)  # thickness of the shell inside the body; 0: chosen from the scene
     shell_cell_m: float = Field(default=0.015, gt=0)  # cell size of the shell's voxel grid
-    samples: int = Field(default=0, ge=0)  # per ray; 0: chosen from the scene
+    spacing_m: float = Field(default=0.0, ge=0)  # of samples on a ray, at the end of training; 0: chosen
     geometry_cells: tuple[PositiveInt, ...] = ()  # per grid level, along the longest side; empty: chosen
     colour_cells: tuple[PositiveInt, ...] = ()  # the same for colour
     channels: int = Field(default=4, ge=1)  # features per grid node and level
@@ -148,12 +148,6 @@ class FastFieldSettings(FieldSettings):
     grid_learning_rate: float = Field(default=5e-2, gt=0)  # of the features, at the start
     network_learning_rate: float = Field(default=1e-2, gt=0)  # at the start
     deformation_learning_rate: float = Field(default=1e-3, ge=0)  # in metres; 0: frames do not deform the body
-
-    @model_validator(mode="after")
-    def _half_the_samples_are_two(self) -> Self:
-        if self.samples in (1, 2):  # most steps use half of them, and opacity is between two
-            raise ValueError(f"samples is {self.samples}: set it to 3 or more, or to 0")
-        return self
 
 
 class PaperFieldSettings(FieldSettings):

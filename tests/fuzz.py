@@ -173,7 +173,7 @@ def _camera_path(folder: Path) -> None:
 
 
 def _preset(folder: Path) -> None:
-    text = "based_on: fast\ntraining:\n  steps: 100\n  field: {samples: 16}\ncapture:\n  max_frames: 10\n"
+    text = "based_on: fast\ntraining:\n  steps: 100\n  field: {width: 16}\ncapture:\n  max_frames: 10\n"
     (folder / "mine.yaml").write_text(text)
 
 

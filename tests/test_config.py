@@ -55,7 +55,6 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("asset: {texture_poses: 0}", "asset.texture_poses"),
         ("asset: {splats: -1}", "asset.splats"),
         ("training: {field: {kind: nerf}}", "training: nerf does not tune poses"),
-        ("training: {field: {samples: 2}}", "training.field: samples is 2"),
         ("training: {losses: {fog: 0.1}}", "training: fast does not model the background"),
     ],
 )
@@ -132,7 +131,7 @@ def test_an_error_of_a_very_deep_override_is_one_line() -> None:
 
 
 def test_a_field_without_its_kind_is_refused(tmp_path: Path) -> None:
-    path = changes(tmp_path, "training: {field: {samples: 5}}")
+    path = changes(tmp_path, "training: {field: {width: 5}}")
     with pytest.raises(InputError, match=rf"^{path}: training\.field: 'kind' is missing; add it$"):
         load_settings(str(path))
 

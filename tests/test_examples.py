@@ -15,7 +15,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 MOST_LINES = 50
 SMALL = SyntheticSettings(size_px=48, train_cameras=3, test_cameras=0, train_frames=2, novel_pose_frames=0)
 FEW = ("training.steps=4", "training.rays_per_frame=32")
-COARSE = ("training.field.samples=8", "training.field.colour_cells=[16]", "training.field.geometry_cells=[16]")
+COARSE = ("training.field.spacing_m=0.03", "training.field.colour_cells=[16]", "training.field.geometry_cells=[16]")
 
 
 def example(name: str) -> ModuleType:

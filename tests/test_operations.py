@@ -34,7 +34,7 @@ LEFT_OUT = {
     r"docker|(?i:kubernetes)|kubectl|containers\]|mkdir -p store c": "containers: tests/flows/test_work_pools.py",
 }
 LATER = r"prefect (server|worker) start"  # these run until the end of the test
-SMALL = """training: {field: {kind: fast, colour_cells: [24, 64], samples: 12}, steps: 12, novel_pose_steps: 2}
+SMALL = """training: {field: {kind: fast, colour_cells: [24, 64], spacing_m: 0.02}, steps: 12, novel_pose_steps: 2}
 detection: {hands: none}
 evaluation: {max_images: 1, max_meshes: 1, report_rows: 1}
 asset: {grid_cells: 48, faces: 1500, texture_px: 64, texture_poses: 1, photograph_frames: 1, correctives: 0}

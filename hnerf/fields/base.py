@@ -79,9 +79,10 @@ class Field(nn.Module, ABC):
     def sample(self, scene: PosedScene[Any], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate radiance and distance along R rays; also return their samples' depths (R, K) in metres."""
 
-    def training_samples(self, progress: float) -> int:
-        """Return the random numbers needed per ray at a training progress from 0 to 1."""
-        return self.samples
+    def training_samples(self, progress: float) -> tuple[int, float | None]:
+        """Return the random numbers needed per ray at a training progress from 0 to 1, and the metres between samples,
+        None if every ray gets all of them."""
+        return self.samples, None
 
     def on_progress(self, progress: float) -> None:
         """Record the progress of the field's training, from 0 to 1. Called once after each step but the last, however

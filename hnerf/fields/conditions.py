@@ -44,29 +44,37 @@ class Conditions:
 class Draws:
     """Random numbers of a batch: jitter (R, K) of samples in their strata; fine (R, K) for hierarchical sampling;
     background (R, 3), the colour behind the rays; probe (R,), which sample's gradient is regularised; view (R, 3),
-    noise on directions. None where rendering needs none."""
+    noise on directions. None where rendering needs none. spacing_m (R,): metres between the samples of a ray, which
+    then are as many as its path requires, at most K; None: all rays get K samples."""
 
     jitter: Tensor
     background: Tensor
     fine: Tensor
     probe: Tensor | None = None
     view: Tensor | None = None
+    spacing_m: Tensor | None = None
 
     @staticmethod
-    def random(rays: int, samples: int, view_sigma: float, generator: torch.Generator) -> "Draws":
+    def random(
+        rays: int, samples: int, view_sigma: float, generator: torch.Generator, spacing_m: float | None = None
+    ) -> "Draws":
         """Draw the numbers of one training step on the generator's device."""
         device = generator.device
         jitter, fine = (torch.rand(rays, samples, generator=generator, device=device) for _ in range(2))
         background = torch.rand(rays, 3, generator=generator, device=device)
         probe = torch.rand(rays, generator=generator, device=device)
         view = view_sigma * torch.randn(rays, 3, generator=generator, device=device)
-        return Draws(jitter, background, fine, probe, view)
+        return Draws(jitter, background, fine, probe, view, _spacing(rays, spacing_m, device))
 
     @staticmethod
-    def deterministic(rays: int, samples: int, device: torch.device) -> "Draws":
+    def deterministic(rays: int, samples: int, device: torch.device, spacing_m: float | None = None) -> "Draws":
         """Return the numbers for rendering: every sample in the middle of its stratum, over black."""
         middle = torch.full((rays, samples), 0.5, device=device)
-        return Draws(middle, torch.zeros(rays, 3, device=device), middle)
+        return Draws(middle, torch.zeros(rays, 3, device=device), middle, spacing_m=_spacing(rays, spacing_m, device))
+
+
+def _spacing(rays: int, spacing_m: float | None, device: torch.device) -> Tensor | None:
+    return None if spacing_m is None else torch.full((rays,), spacing_m, device=device)
 
 
 def shard(batch: Batch, rank: int, world_size: int) -> Batch:

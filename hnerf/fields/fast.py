@@ -32,6 +32,7 @@ ELASTIC_M = 0.01  # displacement whose elastic energy is 1
 SPACING_M = 0.012  # between rendered samples; twice as many gain 0.05 dB on valid-wave for twice the time
 SPACING_PX, MIN_SPACING_M = 4, 0.003  # in close-ups, where fingers would have fringes, and ears speckles
 SAMPLE_COUNTS = (6, 12, 18, 24, 36, 64, 128)  # a ray gets the smallest sufficient number, or the last
+MOST_SAMPLES = 64  # on a ray in training
 HALF_SAMPLES_UNTIL = 0.75  # of the training: as accurate on three captures, in three quarters of the time
 MAX_NEIGHBOUR_DISTANCE_M = 0.03  # canonical; neighbours on a ray that are farther apart lie on different limbs
 MIN_DESCENT_M = 1e-4  # of d_hat from one sample to the next; below it the surface position has no useful derivative
@@ -58,7 +59,7 @@ class FastField(Field):
         """Build an untrained field around the rig. frames: number of rows of the body fit."""
         super().__init__()
         self.settings = settings
-        self.samples = settings.samples
+        self.samples = MOST_SAMPLES
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("rest_normals", vertex_normals(rig.vertices_m, rig.faces), persistent=False)
         for name in ("outer_m", "inner_m"):
@@ -161,18 +162,23 @@ class FastField(Field):
     ) -> tuple[RaySamples, Tensor]:
         """Evaluate rays or, with directions (M, R, 3), the M R neighbours along these, at the depths of the rays
         themselves."""
-        depths, met, core = scene.region.sample_rays(rays, draws.jitter)
-        hit = torch.nonzero(met)[:, 0]  # only these rays are evaluated; the others see nothing
-        points_m = rays.pick(hit).points(depths[hit]).flatten(0, 1)
-        row, background, beside_m = rays.frame[hit].repeat_interleave(depths.shape[1]), draws.background, None
+        depths, count, core = scene.region.sample_rays(rays, draws.jitter, draws.spacing_m)
+        # Only samples that count are evaluated, one ray after another; slots: their places among all, (N,).
+        slots = torch.nonzero((torch.arange(depths.shape[1], device=count.device) < count[:, None]).flatten())[:, 0]
+        ray, depth_m = slots // depths.shape[1], depths.flatten()[slots]
+        row, background, beside_m = rays.frame[ray], draws.background, None
         if directions is not None:
-            beside_m = ((directions - rays.directions)[:, hit, None] * depths[hit, :, None]).flatten(1, 2)
-        bodies, pose = scene.bodies, scene.conditions.pose
+            beside_m = (directions - rays.directions)[:, ray] * depth_m[:, None]
+        bodies, pose, points_m = scene.bodies, scene.conditions.pose, rays.pick(ray).points(depth_m)
         skin, more = bodies.describe_by_limbs(points_m, row, self.reach_m, scene.correction, beside_m=beside_m)
         if directions is not None:
             many = len(directions)
-            hit = (hit + len(rays) * torch.arange(many, device=hit.device)[:, None]).flatten()
-            depths, met, core, row, background = (torch.cat([t] * many) for t in (depths, met, core, row, background))
+            slots = (slots + depths.numel() * torch.arange(many, device=slots.device)[:, None]).flatten()
+            depths, count, core, row, background = (
+                torch.cat([t] * many) for t in (depths, count, core, row, background)
+            )
+        ends = torch.zeros_like(row, dtype=torch.bool)
+        ends[count.cumsum(0)[count > 0] - 1] = True
         rows = torch.cat([row, row[more]])
         described, moved = self._deformed(skin, scene.conditions.frame_row[rows])
         near = described.near & (described.d <= self.outer_m[described.vertex])  # cells reach farther than the shell
@@ -180,42 +186,42 @@ class FastField(Field):
         d = torch.where(described.near, described.d, self.reach_m)
         residual = self._residual(described, pose, rows)
         chosen = least_of_limbs(d + residual, more)
-        skin, described = skin.pick(chosen), described.pick(chosen)
-        d, residual = (t.index_select(0, chosen).view(len(hit), depths.shape[1]) for t in (d, residual))
+        described, d, residual = described.pick(chosen), d.index_select(0, chosen), residual.index_select(0, chosen)
         d_hat = d + residual
-        alpha_dot = alpha_from_sdf(least_around(described, d_hat), self.log_sharpness.exp())
-        # an opaque core: nothing shines through if the surface lies deeper
-        end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])
-        alpha = torch.cat([alpha_dot[:, :-1], end], 1)
-        on_surface, weights = move_to_surface(described, d_hat), weights_from_alpha(alpha.detach())
-        colour = self._ray_colours(scene, on_surface, weights, row)
+
+        def on_rays(values: Tensor, elsewhere: float) -> Tensor:
+            every = values.new_full((depths.numel(), *values.shape[1:]), elsewhere)
+            return every.index_copy(0, slots, values).unflatten(0, depths.shape)
+
+        alpha_dot = alpha_from_sdf(
+            on_rays(least_around(described, d_hat, ends), self.reach_m), self.log_sharpness.exp()
+        )
+        opaque = slots[ends][core[count > 0]]  # an opaque core: nothing shines through if the surface lies deeper
+        alpha = alpha_dot.flatten().index_fill(0, opaque, 1.0).view_as(alpha_dot)
+        on_surface, weights = move_to_surface(described, d_hat, ends), weights_from_alpha(alpha.detach())
+        colour = self._ray_colours(scene, on_surface, weights, slots, row)
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            norms = self._gradient_norms(described, skin, pose, row, draws.probe[hit], depths.shape[1])
+            probed = (count.cumsum(0) - count + (draws.probe * count).long())[count > 0]
+            norms = self._gradient_norms(described.pick(probed), skin.pick(chosen[probed]), pose, row[probed])
         elastic = None
         if moved is not None:
             energy = torch.where(described.near, (moved.index_select(0, chosen) / ELASTIC_M).square().sum(-1), 0.0)
-            elastic = energy.view_as(d).mean(1)
-
-        def everywhere(values: Tensor, elsewhere: float) -> Tensor:
-            return values.new_full((len(met), *values.shape[1:]), elsewhere).index_copy(0, hit, values)
-
-        alpha, alpha_dot, residual = (everywhere(values, 0.0) for values in (alpha, alpha_dot, residual))
-        colour = everywhere(colour, 0.0)
-        seen = described.near.view_as(d).any(1, keepdim=True)
-        d, in_box = everywhere(d, self.reach_m), everywhere(seen.expand_as(d).float(), 0.0)
-        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic)
-        return samples, depths
+            elastic = (on_rays(energy, 0.0).sum(1) / count)[count > 0]
+        in_box = on_rays(described.near, False).any(1, keepdim=True).expand_as(alpha).float()
+        d, residual = on_rays(d, self.reach_m), on_rays(residual, 0.0)
+        return RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic), depths
 
     def coverage(self, samples: RaySamples) -> Tensor:
         """Return the coverage by the surface, not by the solid core that ends rays behind it; rays that start inside
         also count as covered."""
         return occupancy(samples.d_hat, self.log_sharpness.exp()).amax(1)
 
-    def training_samples(self, progress: float) -> int:
-        """Return half the number of samples early in each phase, while the surface or novel poses are still far from
-        their final state."""
-        return self.samples if progress >= HALF_SAMPLES_UNTIL else -(-self.samples // 2)
+    def training_samples(self, progress: float) -> tuple[int, float | None]:
+        """Return twice the spacing early in each phase, while the surface or novel poses are still far from their final
+        state."""
+        few = 1 if progress >= HALF_SAMPLES_UNTIL else 2
+        return MOST_SAMPLES // few, self.settings.spacing_m * few
 
     def samples_needed(self, scene: PosedScene[ShellGrid], rays: Rays) -> Tensor:
         """Return as many samples as the length of a ray's path through the shell requires."""
@@ -249,36 +255,34 @@ class FastField(Field):
         y, d, row = (t.index_select(0, pick) for t in (described.y, described.d, row))
         return torch.zeros_like(described.d).index_copy(0, pick, self.field.residual(y, d, pose, row))
 
-    def _ray_colours(self, scene: PosedScene[ShellGrid], described: Descriptor, weights: Tensor, row: Tensor) -> Tensor:
-        """Return the colours (R, K, 3) of samples (R K,) on rays with weights (R, K). Samples of little weight are not
-        coloured; in rendering, without gradients, there are more such samples, and the colours of the others are scaled
-        up to the weight of the whole ray."""
+    def _ray_colours(
+        self, scene: PosedScene[ShellGrid], described: Descriptor, weights: Tensor, slots: Tensor, row: Tensor
+    ) -> Tensor:
+        """Return the colours (R, K, 3) of samples on rays with weights (R, K). described, slots, row (N,): the samples
+        that count, and their places among all. Samples of little weight are not coloured; in rendering, without
+        gradients, there are more such samples, and the colours of the others are scaled up to the weight of the whole
+        ray."""
         rendering = not torch.is_grad_enabled()
         visible = shown(weights) if rendering else weights > MIN_COLOUR_WEIGHT
-        colour = self._colour(scene.bodies, described, scene.conditions.pose, row, visible.flatten())
+        pick = torch.nonzero(visible.flatten()[slots])[:, 0]
+        found = self._colour(scene.bodies, described.pick(pick), scene.conditions.pose, row[pick])
+        colour = found.new_zeros(weights.numel(), 3).index_copy(0, slots[pick], found)
         share = weights.sum(1) / (weights * visible).sum(1).clamp(min=1e-9) if rendering else weights.new_ones(())
         return colour.view(*weights.shape, 3) * share.view(-1, 1, 1)
 
-    def _colour(self, bodies: PosedBodies, described: Descriptor, pose: Tensor, row: Tensor, visible: Tensor) -> Tensor:
-        """Return the colours (N, 3) of the visible samples, zero elsewhere. Light falls on the surface's own normal, so
-        that shading shapes the surface, too (as in IDR)."""
-        pick = torch.nonzero(visible)[:, 0]
-        y, d, row, corners, barycentric = (
-            t.index_select(0, pick) for t in (described.y, described.d, row, described.corners, described.barycentric)
-        )
+    def _colour(self, bodies: PosedBodies, described: Descriptor, pose: Tensor, row: Tensor) -> Tensor:
+        """Return the colours (N, 3) of samples. Light falls on the surface's own normal, so that shading shapes the
+        surface, too (as in IDR)."""
+        y, d, corners, barycentric = described.y, described.d, described.corners, described.barycentric
         outward = weighted_sum(self.rest_normals, corners, barycentric)
         gradient = self._distance_gradient(y, d, outward, pose, row)
         normal = nn.functional.normalize(bodies.turn(gradient, row, corners, barycentric), dim=-1)
-        colour = described.d.new_zeros(len(visible), 3)
-        return colour.index_copy(0, pick, self.field.colour(y, d, normal, pose, row))
+        return self.field.colour(y, d, normal, pose, row)
 
-    def _gradient_norms(
-        self, described: Descriptor, skin: Descriptor, pose: Tensor, row: Tensor, probe: Tensor, samples: int
-    ) -> Tensor:
-        """Return |grad d_hat| in the canonical frame at one sample per ray, probe (R,) in [0, 1). skin: descriptors
-        before the deformation, which give the outward direction."""
-        pick = torch.arange(len(probe), device=probe.device) * samples + (probe * samples).long()
-        pick = pick[described.near[pick]]
+    def _gradient_norms(self, described: Descriptor, skin: Descriptor, pose: Tensor, row: Tensor) -> Tensor:
+        """Return |grad d_hat| in the canonical frame at samples (N,) within reach. skin: descriptors before the
+        deformation, which give the outward direction."""
+        pick = torch.nonzero(described.near)[:, 0]
         away = (skin.y - skin.s)[pick].detach() * skin.d[pick].detach().sign()[:, None]
         outward = nn.functional.normalize(away, dim=-1)
         return self._distance_gradient(described.y[pick], described.d[pick], outward, pose, row[pick]).norm(dim=-1)
@@ -310,7 +314,7 @@ class FastField(Field):
         """Return c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
         described = self._at_points(bodies, points_m, conditions)[0]
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        return self._colour(bodies, described, conditions.pose, row, torch.ones_like(described.near))
+        return self._colour(bodies, described, conditions.pose, row)
 
     def _at_points(
         self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions, exact_sign: bool = False
@@ -342,27 +346,28 @@ def shown(weights: Tensor) -> Tensor:
     return weights > (weights.amax(1, keepdim=True) / 2).clamp(max=MIN_SHOWN_WEIGHT)
 
 
-def on_same_limb(described: Descriptor, shape: torch.Size) -> Tensor:
-    """Return which samples of R rays, shape (R, K), are on the limb of the next one, both within reach: (R, K - 1)
-    bool."""
-    y, near = (t.unflatten(0, shape) for t in (described.y, described.near))
-    return near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M)
+def on_same_limb(described: Descriptor, ends: Tensor) -> Tensor:
+    """Return which of N samples, one ray after another, are on the limb of the next one on their ray, both within
+    reach, (N - 1,) bool. ends (N,) bool: the last sample of each ray."""
+    y, near = described.y, described.near
+    return near[:-1] & near[1:] & ~ends[:-1] & ((y[1:] - y[:-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M)
 
 
-def least_around(described: Descriptor, d_hat: Tensor) -> Tensor:
-    """Replace d_hat (R, K) at samples that are closer to their limb than both neighbours by the least of the parabola
-    through the three: a ray that passes a finger is closest to it between two samples."""
-    if d_hat.shape[1] < 3:
+def least_around(described: Descriptor, d_hat: Tensor, ends: Tensor) -> Tensor:
+    """Replace d_hat (N,) at samples that are closer to their limb than both neighbours by the least of the parabola
+    through the three: a ray that passes a finger is closest to it between two samples. ends: as in `on_same_limb`."""
+    if len(d_hat) < 3:
         return d_hat
-    same_limb = on_same_limb(described, d_hat.shape)
-    before, at, after = d_hat[:, :-2], d_hat[:, 1:-1], d_hat[:, 2:]
-    closest = same_limb[:, :-1] & same_limb[:, 1:] & (at <= before) & (at <= after)
+    same_limb = on_same_limb(described, ends)
+    before, at, after = d_hat[:-2], d_hat[1:-1], d_hat[2:]
+    closest = same_limb[:-1] & same_limb[1:] & (at <= before) & (at <= after)
     deeper_m = (after - before).square() / (8 * (before + after - 2 * at)).clamp(min=MIN_DESCENT_M)
     return d_hat - nn.functional.pad(torch.where(closest, deeper_m, 0.0), (1, 1))
 
 
-def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
-    """Move samples (R K,) along their rays to where d_hat (R, K), linear between samples, is zero or closest to it.
+def move_to_surface(described: Descriptor, d_hat: Tensor, ends: Tensor) -> Descriptor:
+    """Move samples (N,) along their rays to where d_hat (N,), linear between samples, is zero or closest to it. ends:
+    as in `on_same_limb`.
 
     A sample's opacity is that of the path to the next sample; its colour is that of the surface that makes this path
     opaque. If the next sample is nearer to another limb's surface, or is the first within reach, it is that surface:
@@ -372,20 +377,19 @@ def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     reach. Gradients also flow through the position of the zero (as in IDR, Yariv et al. 2020): a body that moves along
     a ray shows the same point to it, and without that term it would be drawn towards or away from its camera.
     """
-    y, d, near = (t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.near))
-    same_limb, ahead, after = on_same_limb(described, d_hat.shape), d_hat[:, :-1], d_hat[:, 1:]
-    descends = near[:, 1:] & (ahead > after)
+    same_limb, ahead, after = on_same_limb(described, ends), d_hat[:-1], d_hat[1:]
+    descends = described.near[1:] & ~ends[:-1] & (ahead > after)
     descent_m = (ahead - after).clamp(min=MIN_DESCENT_M)
-    back = nn.functional.pad(-(~same_limb[:, :-1]).to(d_hat), (1, 0))  # how far a limb's first sample may go
-    share = torch.where(descends & same_limb, ahead / descent_m, 0.0).clamp(max=1).maximum(back)[..., None]
-    skips = nn.functional.pad(descends & ~same_limb, (0, 1)).flatten()
+    back = torch.zeros_like(ahead)  # how far a limb's first sample may go
+    back[1:] = -(~same_limb[:-1] & ~ends[:-2]).to(d_hat)
+    share = torch.where(descends & same_limb, ahead / descent_m, 0.0).clamp(max=1).maximum(back)[:, None]
+    skips = torch.zeros_like(ends)
+    skips[:-1] = descends & ~same_limb
     source = torch.arange(len(skips), device=skips.device) + skips
 
     def moved(values: Tensor) -> Tensor:
-        values = torch.cat([torch.lerp(values[:, :-1], values[:, 1:], share), values[:, -1:]], 1)
-        return values.flatten(0, 1).index_select(0, source)
+        return torch.cat([torch.lerp(values[:-1], values[1:], share), values[-1:]]).index_select(0, source)
 
     corners, barycentric = (t.index_select(0, source) for t in (described.corners, described.barycentric))
-    return dataclasses.replace(
-        described, y=moved(y), d=moved(d[..., None])[:, 0], corners=corners, barycentric=barycentric
-    )
+    d = moved(described.d[:, None])[:, 0]
+    return dataclasses.replace(described, y=moved(described.y), d=d, corners=corners, barycentric=barycentric)

@@ -16,6 +16,7 @@ from hnerf.fields.rays import Rays
 from hnerf.warp_import import wp
 
 EMPTY, SHELL, SOLID = 0, 1, 2
+MIN_SAMPLES = 6  # on a ray that gets as many as its path requires
 SLACK = 0.5  # cells: most of a cell then lies in the shell; thicknesses leave more room than its corners need
 
 
@@ -67,18 +68,25 @@ class ShellGrid:
             flat = flat * size + index.clamp_(0, size - 1).to(flat.dtype)
         return self.cells.flatten().index_select(0, flat.flatten()).view_as(flat)
 
-    def sample_rays(self, rays: Rays, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return sorted depths (R, K) in metres, evenly distributed over the shell up to the first solid cell; and two
-        masks (R,) bool: whether the ray meets the shell, and whether a solid cell ends it. jitter (R, K) in [0, 1):
-        position in each stratum."""
+    def sample_rays(self, rays: Rays, jitter: Tensor, spacing_m: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return sorted depths (R, K) in metres, evenly distributed over the shell up to the first solid cell; how many
+        of them count, (R,) long, 0 if the ray misses the shell; and whether a solid cell ends it, (R,) bool.
+
+        jitter (R, K) in [0, 1): position in each stratum. spacing_m (R,): path for each sample, of which a ray gets at
+        least MIN_SAMPLES, at most K; without it, a ray gets K. Depths that do not count lie at the end of the path.
+        """
         edges, cumulative, ends = self._march(rays)
-        samples = jitter.shape[1]
-        strata = torch.arange(samples, device=edges.device, dtype=edges.dtype)
-        share = ((strata + jitter) / samples).clamp(max=1 - 2**-24)  # below 1, which rounding would occasionally reach
+        most = jitter.shape[1]
+        strata = torch.arange(most, device=edges.device, dtype=edges.dtype)
+        count = torch.full_like(edges[:, 0], most)
+        if spacing_m is not None:
+            count = (self.cell_m * cumulative[:, -1] / spacing_m).ceil().clamp(min(MIN_SAMPLES, most), most)
+        share = ((strata + jitter) / count[:, None]).clamp(max=1 - 2**-24)  # below 1, which rounding might reach
         wanted = share * cumulative[:, -1:]
         upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
         inside = wanted - cumulative.gather(1, upper - 1)
-        return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0, ends
+        count = torch.where(cumulative[:, -1] > 0, count, 0.0).long()
+        return edges.gather(1, upper - 1) + inside * self.cell_m, count, ends
 
     def path_m(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Return the length of the path over which `sample_rays` distributes the samples, and the depth at which rays

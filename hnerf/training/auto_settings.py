@@ -22,8 +22,7 @@ FINEST_M = 0.008  # least cell size for one posture; with 6 mm, an Adam step tak
 COLOUR_LEVELS, GEOMETRY_LEVELS = 4, 3  # of the grids, in a geometric series
 COARSEST_CELLS = {"colour": 24, "geometry": 16}
 GEOMETRY_COARSER = 1.5  # times coarser than colour: fingers and folds are larger than prints
-MEAN_PATH = 2.4  # length of a ray's path through the shell in thicknesses, mean over rays that hit the person
-SAMPLE_CELLS, MAX_SAMPLE_M = 0.6, 0.006  # sample spacing, in the shell before training tightens it
+SPACING_CELLS, MAX_SPACING_M = 0.6, 0.006  # of samples, at the end of training
 SHELL_MARGIN_M = 0.015  # beyond the extent of the masks, for poses that are still inaccurate
 MIN_THICKNESS_M, MAX_THICKNESS_M = 0.03, 0.15
 MASKS_PER_CAMERA = 6  # number of masks to measure
@@ -119,7 +118,6 @@ def decide(scene: SceneStatistics, settings: TrainingSettings) -> tuple[Training
 def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[str, Decision]:
     posed = scene.frames > 1 and scene.std_rad >= ONE_POSTURE_RAD
     cell_m = max(scene.footprint_m, ALIGNMENT_M if posed else FINEST_M)
-    sample_m = min(SAMPLE_CELLS * cell_m, MAX_SAMPLE_M)
     align = f"poses align to {_mm(ALIGNMENT_M)}" if posed else "there is one posture"
     finest = f"a pixel covers {_mm(scene.footprint_m)}, {align}: cells of {_mm(cell_m)}"
     outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
@@ -129,9 +127,9 @@ def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[s
     return {
         "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, plus a margin"),
         "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, plus a margin"),
-        "samples": Decision(
-            max(8, round(MEAN_PATH * (outer_m + inner_m) / sample_m)),
-            f"one each {_mm(sample_m)} of a ray through a shell of {_mm(outer_m + inner_m)}",
+        "spacing_m": Decision(
+            min(SPACING_CELLS * cell_m, MAX_SPACING_M),
+            f"{SPACING_CELLS:g} cells, at most {_mm(MAX_SPACING_M)}",
         ),
         "colour_cells": Decision(colour_cells, finest),
         "geometry_cells": Decision(

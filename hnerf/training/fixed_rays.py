@@ -33,7 +33,7 @@ class FixedRays:
     @torch.no_grad()
     def psnr(self, scene: PosedScene[Any], rows: Tensor) -> float | None:
         """Return the PSNR on the person's pixels of the frames in rows; None if none is drawn."""
-        rays, samples = self.sample(scene, rows, self.field.samples)
+        rays, samples = self.sample(scene, rows)
         mixed = rays.edge & (not self.field.models_background)  # mixed with a background that only such a field models
         error = (box_colour(samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean())) if len(error) else None
@@ -43,8 +43,7 @@ class FixedRays:
         """Raise TrainingError if the surface is empty or fills the box. Of the background, only rays through the box
         count. A sound surface may cover those near outlines, if it is blurred, or those away from outlines, which in a
         tight shell are mostly rays through holes in masks. One that fills the box covers both."""
-        count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
-        rays, samples = self.sample(scene, rows, count)
+        rays, samples = self.sample(scene, rows, MIN_SAMPLES_PER_RAY if self.field.models_background else 0)
         coverage = self.field.coverage(samples)
         beside = ~rays.person & (samples.in_box > 0).any(1)
         clear = beside & ~rays.edge
@@ -55,13 +54,14 @@ class FixedRays:
         if around > MAX_BACKGROUND_COVERAGE:
             raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
 
-    def sample(self, scene: PosedScene[Any], rows: Tensor, count: int) -> tuple[PixelRays, RaySamples]:
-        """Return the rays at the frames in rows, and their samples as for rendering, with `count` random numbers per
-        ray."""
+    def sample(self, scene: PosedScene[Any], rows: Tensor, least: int = 0) -> tuple[PixelRays, RaySamples]:
+        """Return the rays at the frames in rows, and their samples in the middle of their strata, as many as at the end
+        of training, but with at least `least` random numbers per ray."""
+        most, spacing_m = self.field.training_samples(1.0)
         generator = torch.Generator(rows.device).manual_seed(self.seed)
         rays = self.pixels.draw(rows, RAYS // len(rows) + 1, generator)
         parts, found = math.ceil(len(rays) / self.most_rays), []
         for part in (shard(rays, k, parts) for k in range(parts)):
-            draws = Draws.deterministic(len(part), count, rows.device)
+            draws = Draws.deterministic(len(part), max(most, least), rows.device, spacing_m)
             found.append(self.field.sample(scene, part, draws)[0])
         return rays, concatenate(found)

@@ -192,8 +192,8 @@ class Trainer:
         pick = torch.randperm(len(rows), generator=self.generator, device=rows.device)[: s.frames_per_step]
         count = s.frames_per_step * s.rays_per_frame // len(pick)
         rays = self.pixels.draw(rows[pick], count, self.generator, self.errors)
-        samples = self.field.training_samples(self._progress())
-        draws = Draws.random(len(rays), samples, s.noise, self.generator)
+        samples, spacing_m = self.field.training_samples(self._progress())
+        draws = Draws.random(len(rays), samples, s.noise, self.generator, spacing_m)
         scene = self.scene.with_noise(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
@@ -220,12 +220,12 @@ class Trainer:
         return terms
 
     def _trial_loss(self, about: int) -> tuple[int, Tensor]:
-        """Return the number of rays, about `about`, and the loss of a batch as at the end of training. It does not
-        consume the training's random numbers."""
+        """Return the number of rays, about `about`, and the loss of a batch as at the end of training, with the most
+        samples that a ray can get. It does not consume the training's random numbers."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rows, noise = self.train_rows[: self.settings.frames_per_step][:TRIAL_FRAMES], self.settings.noise
         rays = self.pixels.draw(rows, about // len(rows), generator)
-        draws = Draws.random(len(rays), self.field.training_samples(1.0), noise, generator)
+        draws = Draws.random(len(rays), self.field.training_samples(1.0)[0], noise, generator)
         terms, _ = self.objective(self.scene.with_noise(noise, generator), rays, draws)
         return len(rays), torch.stack(list(terms.values())).sum()
 

@@ -92,7 +92,7 @@ def test_a_frames_displacement_moves_distance_and_colour(moved_m: list[float]):
     residual) and the colour that it has at x in frame 0 and in a pose of no frame."""
     torch.manual_seed(0)
     settings = FastFieldSettings(
-        outer_m=0.1, inner_m=0.1, samples=8, geometry_cells=(16,), colour_cells=(16,), pose_width=1, nodes=1
+        outer_m=0.1, inner_m=0.1, geometry_cells=(16,), colour_cells=(16,), pose_width=1, nodes=1
     )
     rig = box_rig(splits=3)
     field = FastField(rig, settings, frames=2)

@@ -34,7 +34,7 @@ RIG = box_rig(splits=3)
 SETTINGS = FastFieldSettings(
     outer_m=0.07,
     inner_m=0.03,
-    samples=32,
+    spacing_m=0.01,
     geometry_cells=(4,),
     colour_cells=(4,),
     width=8,
@@ -80,7 +80,7 @@ def test_a_tightened_shell_renders_the_same_image():
     bodies, conditions = standing()
     field = field_of(1000.0)
     rays = from_above((0.5, 0.4, 3.0), (0.31, 0.62, 3.0), (0.1, 0.8, 3.0))
-    draws = Draws.deterministic(3, SETTINGS.samples, torch.device("cpu"))
+    draws = Draws.deterministic(3, 32, torch.device("cpu"))
 
     def coverage() -> torch.Tensor:
         return field.coverage(field.sample(field.scene(bodies, conditions), rays, draws)[0])
@@ -99,7 +99,7 @@ def test_rays_that_miss_the_shell_are_empty_and_do_not_affect_others():
     scene = field.scene(bodies, conditions)
 
     def sampled(pick: list[int]) -> list[torch.Tensor]:
-        draws = Draws.deterministic(len(pick), SETTINGS.samples, torch.device("cpu"))
+        draws = Draws.deterministic(len(pick), 32, torch.device("cpu"))
         found, _ = field.sample(scene, rays.pick(torch.tensor(pick)), draws)
         return [found.alpha, found.colour, found.d, found.residual]
 
@@ -272,10 +272,52 @@ def test_the_shell_moves_with_the_displacement_of_a_frame():
     torch.testing.assert_close(still - ends(1), torch.tensor([0.05, 0.06]), atol=0.011, rtol=0)
 
 
-def test_training_starts_with_half_the_samples():
-    """Of 32 samples, three quarters of the steps use 16, the rest all. Rendering uses as many as a ray needs."""
+def test_training_starts_with_twice_the_spacing():
+    """In three quarters of the steps, samples are 2 cm apart, then 1 cm, on paths of up to 64 cm."""
     field = FastField(RIG, SETTINGS, 1)
-    assert [field.training_samples(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
+    early, late = (32, 0.02), (64, 0.01)
+    assert [field.training_samples(done) for done in (0.0, 0.74, 0.75, 1.0)] == [early, early, late, late]
+
+
+@pytest.mark.parametrize(("ends_in_core", "spacing_m"), [(True, 0.015), (False, 0.03)])
+def test_padding_changes_nothing(ends_in_core: bool, spacing_m: float) -> None:
+    """Two rays together, with paths of different lengths through the shell: each has the colour, opacity, losses and
+    gradients that it has alone, where it has no padding."""
+    settings = SETTINGS.model_copy(update={"nodes": 2})
+    field = field_of(60.0, settings)
+    torch.nn.init.normal_(field.field.colour_grids.features, std=10.0)
+    torch.nn.init.normal_(field.field.geometry_grids.features, std=1.0)
+    assert field.deformation is not None
+    torch.nn.init.normal_(field.deformation.displacement, std=0.01)
+    bodies, conditions = standing()
+    scene = dataclasses.replace(field.scene(bodies, conditions), correction=bodies.correction())
+    slanted = torch.nn.functional.normalize(torch.tensor([[0.0, 0.0, -1.0], [0.9, 0.1, -1.0]]), dim=1)
+    origins_m = torch.tensor([[0.45, 0.4, 3.0], [-2.0 if ends_in_core else -2.1, 0.3, 3.0]])
+    rays = Rays(origins_m, slanted, torch.zeros(2).long())
+    if not ends_in_core:
+        scene.region.cells[scene.region.cells == 2] = 1
+    draws = Draws.random(2, 64, 0.0, torch.Generator().manual_seed(0), spacing_m)
+    _, count, core = scene.region.sample_rays(rays, draws.jitter, draws.spacing_m)
+    few, many = sorted(count.tolist())
+    assert 6 < few < many < 64 and core.all() == ends_in_core
+
+    def seen(which: list[int], samples: int) -> list[torch.Tensor]:
+        picked = {f.name: getattr(draws, f.name)[which] for f in dataclasses.fields(draws)}
+        own = Draws(**picked | {"jitter": picked["jitter"][:, :samples]})
+        found, depths = field.sample(scene, rays.pick(torch.tensor(which)), own)
+        assert found.elastic is not None
+        total = pixel_colour(found.alpha, found).sum() + found.elastic.sum() + found.gradient_norm.sum()
+        parameters = [field.deformation.displacement, *field.field.parameters()]  # type: ignore[union-attr]
+        gradients = torch.autograd.grad(total + torch.relu(-found.d_hat).sum(), parameters, allow_unused=True)
+        images = composited(found, depths), found.elastic, found.gradient_norm, torch.relu(-found.d_hat).sum(1)
+        return [*images, *(g if g is not None else torch.zeros(1) for g in gradients)]
+
+    together = seen([0, 1], 64)
+    alone = [seen([ray], int(count[ray])) for ray in (0, 1)]
+    for both, first, second in zip(together[:4], *(values[:4] for values in alone), strict=True):
+        torch.testing.assert_close(both, torch.cat([first, second]))
+    for both, first, second in zip(together[4:], *(values[4:] for values in alone), strict=True):
+        torch.testing.assert_close(both, first + second, atol=1e-4, rtol=1e-3)
 
 
 def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
@@ -286,11 +328,16 @@ def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
     return Descriptor(d, y, y, torch.tensor(near), torch.zeros(len(d), 3).long(), torch.zeros(len(d), 3))
 
 
+def last_of(*counts: int) -> torch.Tensor:
+    """Return which samples are the last of their rays, of `counts` samples each."""
+    return torch.cat([torch.arange(count) == count - 1 for count in counts])
+
+
 def test_samples_in_front_of_the_surface_move_onto_it():
     """Samples lie at 12, 6, -2 and -8 mm above the skin, the surface at 1 mm. The second sample moves 5 / 8 of the way
     to the third, and the first moves to the second. Those behind the surface stay."""
     described = on_a_ray([0.012, 0.006, -0.002, -0.008], [True] * 4)
-    moved = move_to_surface(described, described.d[None] - 0.001)
+    moved = move_to_surface(described, described.d - 0.001, last_of(4))
     expected = torch.tensor([0.006, 0.001, -0.002, -0.008])
     assert torch.allclose(moved.d, expected, atol=1e-7)
     assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
@@ -299,7 +346,7 @@ def test_samples_in_front_of_the_surface_move_onto_it():
 def test_samples_stay_if_the_next_is_out_of_reach_or_near_another_limb():
     described = on_a_ray([0.005, -0.005, 0.005, 0.006], [True, False, True, True])
     described.y[3, 0] = 0.1
-    moved = move_to_surface(described, described.d[None])
+    moved = move_to_surface(described, described.d, last_of(4))
     for name in ("d", "y", "corners", "barycentric"):
         assert torch.equal(getattr(moved, name), getattr(described, name))
 
@@ -312,7 +359,7 @@ def test_a_sample_in_front_of_another_limb_moves_onto_that_limb(first_near):
     described = on_a_ray([0.005, -0.001, -0.006], [first_near, True, True])
     described.y[1:, 0] = 0.1
     described.corners[1:], described.barycentric[1:] = 7, 0.5
-    moved = move_to_surface(described, described.d[None])
+    moved = move_to_surface(described, described.d, last_of(3))
     on_trunk = torch.tensor([[0.1, 0, 0], [0.1, 0, 0], [0.1, 0, -0.006]])
     torch.testing.assert_close(moved.y, on_trunk, atol=1e-7, rtol=0)
     torch.testing.assert_close(moved.d, on_trunk[:, 2], atol=1e-7, rtol=0)
@@ -323,16 +370,17 @@ def test_a_sample_in_front_of_another_limb_moves_onto_that_limb(first_near):
 def test_the_least_distance_along_a_ray_is_interpolated_between_samples():
     """The distance is (t^2 + 2) mm at t = -1.75, -0.75, 0.25 and 1.25 steps, so the least is 2 mm. It is not
     interpolated at the ends, nor if a neighbour is out of reach or on another limb."""
-    d_hat = 1e-3 * (torch.tensor([[-1.75, -0.75, 0.25, 1.25]]).square() + 2)
-    described = on_a_ray(d_hat[0].tolist(), [True] * 4)
+    d_hat, ends = 1e-3 * (torch.tensor([-1.75, -0.75, 0.25, 1.25]).square() + 2), last_of(4)
+    described = on_a_ray(d_hat.tolist(), [True] * 4)
     expected = d_hat.clone()
-    expected[0, 2] = 0.002
-    torch.testing.assert_close(least_around(described, d_hat), expected, atol=1e-7, rtol=0)
-    assert torch.equal(least_around(on_a_ray(d_hat[0].tolist(), [True, True, True, False]), d_hat), d_hat)
+    expected[2] = 0.002
+    torch.testing.assert_close(least_around(described, d_hat, ends), expected, atol=1e-7, rtol=0)
+    assert torch.equal(least_around(on_a_ray(d_hat.tolist(), [True, True, True, False]), d_hat, ends), d_hat)
+    assert torch.equal(least_around(described, d_hat, last_of(2, 2)), d_hat)  # on two rays
     described.y[3, 0] = 0.1
-    assert torch.equal(least_around(described, d_hat), d_hat)
-    for few in (1, 2):
-        assert torch.equal(least_around(on_a_ray([0.01] * few, [True] * few), d_hat[:, :few]), d_hat[:, :few])
+    assert torch.equal(least_around(described, d_hat, ends), d_hat)
+    for few in (0, 1, 2):
+        assert torch.equal(least_around(on_a_ray([0.01] * few, [True] * few), d_hat[:few], last_of(few)), d_hat[:few])
 
 
 def test_the_surface_point_moves_correctly_with_its_body():
@@ -345,7 +393,7 @@ def test_the_surface_point_moves_correctly_with_its_body():
         d = height + points_on_rays + down
         y = torch.stack([x - points_on_rays, torch.zeros_like(x), d], 1)
         described = dataclasses.replace(on_a_ray([0.0, 0.0], [True] * 2), d=d, y=y)
-        return move_to_surface(described, d[None]).y[0]
+        return move_to_surface(described, d, last_of(2)).y[0]
 
     still = torch.zeros((), dtype=torch.double, requires_grad=True)
     skin = torch.tensor([0.003, 0.0, 0.0], dtype=torch.double)
@@ -365,7 +413,7 @@ def test_colour_gradients_by_the_body_position_match_finite_differences():
         torch.nn.init.normal_(grid)
     direction = torch.nn.functional.normalize(torch.tensor([[0.4, 0.3, -1.0]]), dim=-1)
     rays = Rays(torch.tensor([[0.5, 0.4, 0.5]]) - 2 * direction, direction, torch.zeros(1, dtype=torch.long))
-    draws = Draws.deterministic(1, SETTINGS.samples, torch.device("cpu"))
+    draws = Draws.deterministic(1, 32, torch.device("cpu"))
 
     def colour(move_m: torch.Tensor) -> torch.Tensor:
         correction.move_m = move_m[None]
@@ -382,15 +430,28 @@ def test_colour_gradients_by_the_body_position_match_finite_differences():
 
 def test_a_ray_that_grazes_the_surface_has_finite_gradients():
     described = on_a_ray([0.001, 0.001, 0.0, 0.0], [True] * 4)
-    d_hat = described.d[None].requires_grad_()
-    move_to_surface(described, d_hat).y.sum().backward()
+    d_hat = described.d.clone().requires_grad_()
+    move_to_surface(described, d_hat, last_of(4)).y.sum().backward()
     assert d_hat.grad is not None
     assert torch.isfinite(d_hat.grad).all()
 
 
+def test_samples_of_other_rays_are_no_neighbours() -> None:
+    """Two rays with the same samples: each moves as if alone. So do rays of which one ends where the next begins inside
+    another limb."""
+    low = [0.012, 0.006, -0.002, -0.008]
+    described = on_a_ray([*low, *low], [True] * 8)
+    moved = move_to_surface(described, described.d - 0.001, last_of(4, 4))
+    torch.testing.assert_close(moved.d, torch.tensor([0.006, 0.001, -0.002, -0.008] * 2), atol=1e-7, rtol=0)
+    apart = on_a_ray([0.004, 0.002, -0.003, -0.006], [True] * 4)
+    apart.y[2:, 0] = 0.1
+    moved = move_to_surface(apart, apart.d, last_of(2, 2))
+    torch.testing.assert_close(moved.d, torch.tensor([0.002, 0.002, -0.003, -0.006]), atol=1e-7, rtol=0)
+
+
 def test_samples_stay_if_the_ray_moves_away_from_the_surface():
     described = on_a_ray([0.001, 0.004, 0.004, 0.009], [True] * 4)
-    assert torch.equal(move_to_surface(described, described.d[None]).d, described.d)
+    assert torch.equal(move_to_surface(described, described.d, last_of(4)).d, described.d)
 
 
 def test_the_distance_is_the_minimum_over_limbs() -> None:

@@ -28,7 +28,7 @@ THETA = torch.tensor([[[0.0, 0, 0], [-0.4, 0.5, 0.6]], [[0.0, 0, 0], [0.1, 0.2, 
 ROOT = torch.eye(4).repeat(2, 1, 1)
 ROOT[1, :2] = torch.tensor([[0.0, -1, 0, 2.55], [1, 0, 0, 0]])
 SETTINGS = FastFieldSettings(
-    outer_m=0.06, inner_m=0.04, shell_cell_m=0.02, samples=12, geometry_cells=(2,), colour_cells=(2,), pose_width=1
+    outer_m=0.06, inner_m=0.04, shell_cell_m=0.02, geometry_cells=(2,), colour_cells=(2,), pose_width=1
 )
 RAY = Rays(torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1]))
 OUTERMOST, INNERMOST = 0.3, 0.99  # fractions of the ray's samples

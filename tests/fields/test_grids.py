@@ -7,9 +7,7 @@ from hnerf.config import FastFieldSettings
 from hnerf.fields.grids import CanonicalField
 from tests.fields.plain_grids import everywhere
 
-SETTINGS = FastFieldSettings(
-    outer_m=0.05, geometry_cells=(1, 2), colour_cells=(1,), channels=1, width=4, pose_width=2, samples=3
-)
+SETTINGS = FastFieldSettings(outer_m=0.05, geometry_cells=(1, 2), colour_cells=(1,), channels=1, width=4, pose_width=2)
 Y, D = torch.tensor([[0.2, 0.3, 0.4]]), torch.tensor([-0.01])
 NORMAL = torch.tensor([[1.0, 0.0, -0.5]])
 POSE = torch.tensor([[7.0, 8.0, 9.0], [0.1, 0.2, 0.3]]), torch.tensor([1])  # two poses, and the row of each point

@@ -108,16 +108,31 @@ def test_samples_lie_in_the_shell_in_front_of_the_solid_core():
     grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
     origins_m, directions = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]), torch.eye(3)[[0, 0]]
     rays = Rays(origins_m, directions, torch.zeros(2, dtype=torch.long))
-    depths, met, ended = grid.sample_rays(rays, torch.full((2, 16), 0.5))
+    depths, count, ended = grid.sample_rays(rays, torch.full((2, 16), 0.5))
     length_m, start_m = grid.path_m(rays)
     assert length_m[0].item() == pytest.approx(0.09, abs=0.03) and length_m[1] == 0
     assert start_m[0].item() == pytest.approx(0.63, abs=0.01)  # two cells before the shell
-    assert met.tolist() == ended.tolist() == [True, False]
+    assert count.tolist() == [16, 0] and ended.tolist() == [True, False]
     assert (depths[0].diff() > 0).all()
     assert depths[0, 0].item() == pytest.approx(0.65, abs=0.03)
     assert depths[0, -1].item() == pytest.approx(0.74, abs=0.03)
     jitter = torch.full((2, 20), 1 - 2**-24)  # the largest below 1; 19 plus it rounds to 20 in single precision
     assert grid.sample_rays(rays, jitter)[0][0, -1].item() == pytest.approx(0.74, abs=0.03)
+
+
+def test_a_ray_gets_as_many_samples_as_its_path_requires():
+    """The path of 9 cm, give or take two cells, has a sample every 5 mm: as if it had been given so many. Every 3 cm,
+    it would have 3, but no ray has fewer than 6; every millimetre 90, but there are random numbers for 32."""
+    grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
+    rays = Rays(torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]), torch.eye(3)[[0, 0]], torch.zeros(2).long())
+    jitter = torch.rand(2, 32, generator=torch.Generator().manual_seed(0))
+    depths, (count, missing), _ = grid.sample_rays(rays, jitter, torch.full((2,), 0.005))
+    length_m = grid.path_m(rays)[0][0].item()
+    assert count == round(length_m / 0.005) and 14 <= count <= 22 and missing == 0
+    torch.testing.assert_close(depths[0, :count], grid.sample_rays(rays, jitter[:, :count])[0][0])
+    assert (depths[0, count:] >= depths[0, count - 1]).all()
+    few, many = (grid.sample_rays(rays, jitter, torch.full((2,), spacing_m))[1] for spacing_m in (0.03, 0.001))
+    assert (few[0], many[0]) == (6, 32)
 
 
 def test_a_gap_between_two_shells_is_not_sampled():

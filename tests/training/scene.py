@@ -26,7 +26,7 @@ FRAMES = (0, 1, 2)
 TINY_FIELDS = {
     "fast": {
         "kind": "fast",
-        "samples": 8,
+        "spacing_m": 0.09,
         "geometry_cells": [4],
         "colour_cells": [4],
         "width": 8,

@@ -34,15 +34,15 @@ def decided(scene: SceneStatistics, **given: object) -> tuple[TrainingSettings, 
 def test_settings_equal_values_computed_by_hand():
     """Pixels of 2 cm give 96 cells on 1.92 m, in levels from 24 by factors of 4 ** (1 / 3); for geometry 64, in levels
     from 16 by factors of 2. Masks reach 3.5 cm out and 0.5 cm in. With a margin of 1.5 cm, the shell is 5 cm, and the
-    minimum of 3 cm; 2.4 x 8 cm / 6 mm = 32 samples. Four million pixels at 2500 per step, each drawn 1.5 times: 2400
-    steps."""
+    minimum of 3 cm. Samples are 6 mm apart, not 0.6 cells of 2 cm. Four million pixels at 2500 per step, each drawn
+    1.5 times: 2400 steps."""
     settings, decisions = decided(SCENE)
     fast = settings.field
     assert fast.colour_cells == (24, 38, 60, 96)
     assert fast.geometry_cells == (16, 32, 64)
-    assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 32)
+    assert (fast.outer_m, fast.inner_m, fast.spacing_m) == (0.05, 0.03, 0.006)
     assert (fast.pose_width, settings.steps) == (8, 2400)
-    assert decisions["field.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
+    assert decisions["field.spacing_m"].reason == "0.6 cells, at most 6.0 mm"
 
 
 @pytest.mark.parametrize(
@@ -54,31 +54,29 @@ def test_settings_equal_values_computed_by_hand():
         ({"footprint_m": 0.1}, {}, {"colour_cells": (19,), "geometry_cells": (13,)}),
         # 128 / 1.5 = 85, whatever the pixel size.
         ({}, {"colour_cells": [24, 128]}, {"geometry_cells": (16, 37, 85)}),
-        # 2.4 x (20 + 5) cm / 6 mm = 100.
-        ({}, {"outer_m": 0.2, "inner_m": 0.05}, {"samples": 100}),
-        # A skirt reaches 30 cm out from the body, the shell at most 15: 2.4 x (15 + 3) cm / 6 mm = 72.
-        ({"outside_m": 0.3}, {}, {"outer_m": 0.15, "inner_m": 0.03, "samples": 72}),
+        # A skirt reaches 30 cm out from the body, the shell at most 15.
+        ({"outside_m": 0.3}, {}, {"outer_m": 0.15, "inner_m": 0.03}),
     ],
-    ids=["small pixels", "large pixels", "given cells", "given shell", "skirt"],
+    ids=["small pixels", "large pixels", "given cells", "skirt"],
 )
-def test_cells_shell_and_samples_by_hand(changed: dict, given: dict, expected: dict):
+def test_cells_and_shell_by_hand(changed: dict, given: dict, expected: dict):
     fast = decided(replace(SCENE, **changed), field={"kind": "fast"} | given)[0].field
     assert {name: getattr(fast, name) for name in expected} == expected
 
 
 @pytest.mark.parametrize("nearly_static", [{"frames": 1}, {"std_rad": 0.001}])
 def test_with_one_posture_cells_are_as_fine_as_pixels(nearly_static: dict):
-    """Cells shrink to 8 mm: 240 on 1.92 m, 160 for geometry. With a sample per 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
+    """Cells shrink to 8 mm: 240 on 1.92 m, 160 for geometry. Samples are 0.6 cells apart, 4.8 mm."""
     for footprint_m in (0.008, 0.001):
         settings, decisions = decided(replace(SCENE, footprint_m=footprint_m, **nearly_static))
         assert (settings.field.colour_cells[-1], settings.field.geometry_cells[-1]) == (240, 160)
-        assert settings.field.samples == 40
+        assert settings.field.spacing_m == pytest.approx(0.0048)
         assert "there is one posture: cells of 8.0 mm" in decisions["field.colour_cells"].reason
 
 
 def test_given_settings_are_kept():
-    settings, decisions = decided(SCENE, steps=7, field={"kind": "fast", "samples": 5, "outer_m": 0.2})
-    assert (settings.steps, settings.field.samples, settings.field.outer_m) == (7, 5, 0.2)
+    settings, decisions = decided(SCENE, steps=7, field={"kind": "fast", "spacing_m": 0.005, "outer_m": 0.2})
+    assert (settings.steps, settings.field.spacing_m, settings.field.outer_m) == (7, 0.005, 0.2)
     open_ones = ("inner_m", "colour_cells", "geometry_cells", "pose_width", "nodes")
     assert set(decisions) == {*(f"field.{name}" for name in open_ones), "one_posture", "ground"}
 

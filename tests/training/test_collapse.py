@@ -56,7 +56,7 @@ def test_a_surface_between_training_samples_is_not_a_collapse(tmp_path: Path):
     """With two samples per ray across 5 m, hardly any falls into the column."""
     trainer = trainer_of(tmp_path, "paper")
     trainer.field.samples = 2
-    rays, samples = trainer.fixed_rays.sample(trainer.scene, trainer.train_rows, 2)
+    rays, samples = trainer.fixed_rays.sample(trainer.scene, trainer.train_rows)
     assert trainer.field.coverage(samples)[rays.person].mean() < fixed_rays.MIN_PERSON_COVERAGE
     trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
 

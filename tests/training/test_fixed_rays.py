@@ -39,7 +39,9 @@ def psnr(levels: list[int], person: list[bool], edge: list[bool], models_backgro
         rays_from_px=torch.eye(3)[None],
         centres_m=torch.zeros(1, 3),
     )
-    field: Any = SimpleNamespace(samples=2, models_background=models_background, sample=sample)
+    field: Any = SimpleNamespace(
+        training_samples=lambda _: (2, None), models_background=models_background, sample=sample
+    )
     return FixedRays(field, pixels, 0, 1000).psnr(PosedScene(None, None, None), torch.tensor([0]))  # type: ignore[arg-type]
 
 

@@ -12,7 +12,7 @@ from tests.body.boxes import box_rig
 
 RIG = box_rig(splits=2)
 SETTINGS = FastFieldSettings(
-    outer_m=0.08, inner_m=0.06, shell_cell_m=0.05, samples=4, geometry_cells=(2,), colour_cells=(2,), pose_width=1
+    outer_m=0.08, inner_m=0.06, shell_cell_m=0.05, geometry_cells=(2,), colour_cells=(2,), pose_width=1
 )
 SEEN_M = 0.005  # visible on either side of a surface with a logistic of 1000 per metre
 ROOM_M = 0.012

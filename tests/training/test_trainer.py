@@ -80,7 +80,7 @@ def test_a_field_can_overfit_the_column(tmp_path: Path):
     left out, because those of the photograph are not antialiased."""
     capture, masks, body = record(tmp_path / "capture")
     rates = {"network_learning_rate": 0.02, "grid_learning_rate": 0.05}
-    fast = TINY.field.model_dump() | rates | {"samples": 32, "outer_m": 0.1}
+    fast = TINY.field.model_dump() | rates | {"spacing_m": 0.015, "outer_m": 0.1}
     out = tmp_path / "out"
     out.mkdir()
     rare = {"absorb_steps": 60, "checkpoint_steps": 120}
