@@ -201,7 +201,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_overrides(caged, "override a setting under `limits.`")
     _add_calibrate(add(commands.calibrate, caged))
     synchronise = add(commands.synchronise, caged)
-    synchronise.add_argument("folder", type=path, help="calibrated capture whose cameras did not start together")
+    what = "capture, calibrated or not, whose cameras did not start together"
+    synchronise.add_argument("folder", type=path, help=what)
     cameras = add(commands.export_cameras, caged)
     what = "capture folder, what `hnerf calibrate` wrote, or cameras/ or calibration/ of a subject"
     cameras.add_argument("folder", type=path, help=what)

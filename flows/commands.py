@@ -31,7 +31,7 @@ def settings(options: argparse.Namespace) -> None:
 
 
 def models(options: argparse.Namespace) -> None:
-    """Download the networks for people, hands and LPIPS, and three.js for the viewer; needed once."""
+    """Download the networks for people, faces, hands and LPIPS, and three.js for the viewer; needed once."""
     from hnerf.models import fetch_models
 
     print(f"networks: {fetch_models()}")

@@ -1,4 +1,4 @@
-"""Export of a trained avatar to files that any 3-D program opens."""
+"""Export of a trained avatar to files for other programs: USD, glTF, BVH and, with Blender, FBX and Alembic."""
 
 import dataclasses
 import logging

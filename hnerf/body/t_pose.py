@@ -19,8 +19,9 @@ BONES = {
 
 
 def t_pose(rig: Rig) -> Float[Tensor, "J 3"]:
-    """Return theta (J, 3) with arms and hands straight out to the sides, palms as they turn with them, and legs
-    straight down. Bones take the shortest rotation; feet, trunk and head keep their directions, fingers stay at rest.
+    """Return theta (J, 3) with arms and hands straight out to the sides, and legs straight down. Bones take the
+    shortest rotation, which also decides where palms face; feet, trunk and head keep their directions, fingers stay at
+    rest.
     """
     names, joints_m = rig.joint_names, rig.joints_m.double()
     turns: list[Tensor] = []  # of each joint, in the body frame

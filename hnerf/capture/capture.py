@@ -1,9 +1,9 @@
 """The normalised capture that every later stage reads.
 
 A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted) and, if the
-recording has them, `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz` and
-`poses.npz`, and `given_hands.npz`; if a network detected people, `person/<camera>/<frame:06d>.png`; once hands were
-looked for, `hands.npz`.
+recording has them, `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz`,
+`given_hands.npz`, `poses.npz` and `boards.npz` (corners of boards); if a network detected people,
+`landmarks/<camera>.npz` and `person/<camera>/<frame:06d>.png`; once hands were looked for, `hands.npz`.
 """
 
 import dataclasses

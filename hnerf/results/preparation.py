@@ -48,8 +48,8 @@ class DetectedCamera(TypedDict):
 
 
 class DetectedPerson(TypedDict):
-    """A person that was detected. person: "subject", or "left 1" and so on for those left out; height_px: median;
-    claim: to be the subject, relative to whoever has most."""
+    """A person that was detected. person: "subject"; of people left out, "left 1", "left 2" and so on (no side is
+    meant); height_px: median; claim: to be the subject, relative to whoever has most."""
 
     person: str
     cameras: int

@@ -38,7 +38,7 @@ def claim_lines(result: Result) -> list[str]:
 
 def more_is_better(result: Result) -> Iterator[Finding]:
     """Check, for every method, that scores are better with the most cameras or frames than with the fewest, and never
-    fall in between by more than another seed may cost."""
+    drop between consecutive values by more than seed noise."""
     for key, (_, _, sign) in FIGURES.items():
         for name, curve in sweep_curves(result, key).items():
             values = [value for _, value in curve]
