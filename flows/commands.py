@@ -137,8 +137,13 @@ def _calibrate_from_person(options: argparse.Namespace, out: Path) -> None:
 
 
 def _is_pose2sim(folder: Path) -> bool:
-    """Return whether a recording is read in Pose2Sim's layout once it has a calibration in that layout."""
-    return (folder / "pose").is_dir() and not (folder / "extri.yml").exists()
+    """Return whether a recording is read in Pose2Sim's layout once it has a calibration in that layout: other
+    calibrations in the folder may take precedence."""
+    from hnerf.capture.formats.pose2sim import Pose2Sim
+    from hnerf.capture.ingest import LAYOUTS
+
+    preceding = LAYOUTS[: LAYOUTS.index(Pose2Sim)]
+    return (folder / "pose").is_dir() and not any(layout.recognises(folder) for layout in preceding)
 
 
 def synchronise(options: argparse.Namespace) -> None:

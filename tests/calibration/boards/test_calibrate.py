@@ -1,6 +1,7 @@
 """Board calibration: known cameras around a board on a known path, and real footage."""
 
 import dataclasses
+import shutil
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from flows.commands import _is_pose2sim
 from hnerf.calibration.boards import calibrate as calibration_boards
 from hnerf.calibration.boards.bundle import Adjustment, BoardFit, Poses
 from hnerf.calibration.boards.calibrate import board_evidence, calibrate_from_boards, visible_and_found
@@ -18,7 +20,7 @@ from hnerf.calibration.boards.rig import compare_pairs, fixes_pose, planar_corne
 from hnerf.capture.board_footage import Board, BoardCorners, BoardFootage
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.easymocap import EasyMocap
-from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.formats.export import write_calibration, write_cameras
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import recognise
 from hnerf.capture.lens import Lens
@@ -312,6 +314,21 @@ def test_the_board_in_the_ground_frame_defines_the_floor(tmp_path: Path, monkeyp
     layout = recognise(tmp_path / "pose2sim")
     assert isinstance(layout, Pose2Sim)
     assert layout.lenses()["b"].t_m == pytest.approx(calibration.lenses["b"].t_m)
+
+
+@pytest.mark.parametrize("older", ["colmap", "caliscope", "aniposelib", "easymocap", None])
+def test_new_cameras_are_the_ones_that_are_read_once_they_are_copied(tmp_path: Path, older: str | None) -> None:
+    """A calibration that precedes Pose2Sim's in the order of layouts would hide its file."""
+    folder, out = tmp_path / "film", tmp_path / "cameras"
+    (folder / "pose").mkdir(parents=True)
+    old, new = (Lens("a", np.diag([f, f, 1.0]), np.zeros(5), np.eye(3), np.zeros(3), (64, 48)) for f in (50, 60))
+    if older:
+        write_cameras(folder, [old], older)
+    write_calibration(out, [new], "boards", (), _is_pose2sim(folder))
+    shutil.copytree(out, folder, dirs_exist_ok=True)  # what the command says to do to use the cameras
+    layout = recognise(folder)
+    assert [lens.K[0, 0] for lens in layout.lenses().values()] == [60]
+    assert isinstance(layout, Pose2Sim if older is None else EasyMocap)
 
 
 def test_a_board_found_in_few_images_is_refused_as_the_wrong_board(
