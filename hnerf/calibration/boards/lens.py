@@ -11,6 +11,7 @@ from hnerf.evenly_spaced import evenly_spaced
 
 MAX_PICTURES = 40  # evenly spaced
 MIN_PICTURES = 10
+MIN_MOVED = 0.02  # of an image's longer side, by the median corner: pictures of a board held still count as one
 MIN_TILTED = 5  # images; boards parallel to the image plane say nothing about the focal length or its error
 TILT_DEG = 15.0
 K3_SIGMAS = 5.0  # standard deviations that k3 must exceed: few lenses need it, and it bends images beyond the corners
@@ -19,8 +20,9 @@ MAX_FOCAL_STD = 0.01  # relative standard deviation up to which a focal length i
 
 @dataclass(frozen=True)
 class LensEstimate:
-    """Estimated lens. pictures: number of images used; lens: None if they are too few; tilted: how many of them show
-    the board TILT_DEG or more out of the image plane; focal_std: the focal length's relative standard deviation."""
+    """Estimated lens. pictures: number of images used, between which the board moved; lens: None if they are too few;
+    tilted: how many of them show the board TILT_DEG or more out of the image plane; focal_std: the focal length's
+    relative standard deviation."""
 
     pictures: int
     lens: Lens | None = None
@@ -36,7 +38,7 @@ class LensEstimate:
     def certainty(self) -> str:
         """Return how well the lens is known, in words."""
         if self.lens is None:
-            return f"{self.pictures} pictures of the board where {MIN_PICTURES} are needed"
+            return f"{self.pictures} different pictures of the board where {MIN_PICTURES} are needed"
         known = f"focal length known to {100 * self.focal_std:.1f} %"
         return f"{self.pictures} pictures of the board, {self.tilted} of them tilted, {known}"
 
@@ -45,11 +47,11 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
     """Estimate intrinsics and distortion k1 k2 p1 p2, and k3 if the images prove it, as those of wide lenses do, from
     corners_px (F, N, 2) as recorded, NaN where not seen (Zhang 2000).
 
-    The standard deviation is that of the least squares (cv2.calibrateCameraExtended).
+    The standard deviation is that of the least squares (cv2.calibrateCameraExtended), which takes pictures for
+    independent: of those between which the board did not move, only the first is used.
     """
-    chosen = evenly_spaced(
-        np.flatnonzero(fixes_pose(corners_m, np.isfinite(corners_px[..., 0]))).tolist(), MAX_PICTURES
-    )
+    found = np.flatnonzero(fixes_pose(corners_m, np.isfinite(corners_px[..., 0])))
+    chosen = evenly_spaced(found[_moved(corners_px[found], MIN_MOVED * max(size_px))].tolist(), MAX_PICTURES)
     if len(chosen) < MIN_PICTURES:
         return LensEstimate(len(chosen))
     seen = [np.isfinite(corners_px[f, :, 0]) for f in chosen]
@@ -65,3 +67,15 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
     lens = Lens(name, K, distortion.ravel()[: 5 if needs_k3 else 4], np.eye(3), np.zeros(3), size_px)
     tilted = sum(abs(cv2.Rodrigues(turn)[0][2, 2]) < np.cos(np.deg2rad(TILT_DEG)) for turn in turns)
     return LensEstimate(len(chosen), lens, tilted, float(max(deviation[0, 0] / K[0, 0], deviation[1, 0] / K[1, 1])))
+
+
+def _moved(corners_px: np.ndarray, least_px: float) -> list[int]:
+    """Return the pictures, of corners (F, N, 2), in which the median of the corners seen in both is at least so far
+    from its place in each picture returned before."""
+    kept = list[int]()
+    for i, corners in enumerate(corners_px):
+        distances_px = np.linalg.norm(corners_px[kept] - corners, axis=-1)
+        common = np.isfinite(distances_px)
+        if all(np.median(d[seen]) >= least_px for d, seen in zip(distances_px, common, strict=True) if seen.any()):
+            kept.append(i)
+    return kept

@@ -15,7 +15,7 @@ from flows.commands import _is_pose2sim
 from hnerf.calibration.boards import calibrate as calibration_boards
 from hnerf.calibration.boards.bundle import Adjustment, BoardFit, Poses
 from hnerf.calibration.boards.calibrate import board_evidence, calibrate_from_boards, visible_and_found
-from hnerf.calibration.boards.lens import estimate_lens
+from hnerf.calibration.boards.lens import _moved, estimate_lens
 from hnerf.calibration.boards.rig import compare_pairs, fixes_pose, planar_corners, solve_boards, solve_rig
 from hnerf.capture.board_footage import Board, BoardCorners, BoardFootage
 from hnerf.capture.formats.caliscope import Caliscope
@@ -226,6 +226,29 @@ def test_a_lens_is_reliable_only_if_the_images_determine_it() -> None:
     assert facing.reliable_lens is None and few.reliable_lens is None and few.pictures == 9
 
 
+def test_pictures_of_a_board_held_still_count_as_one() -> None:
+    """Forty of them repeat the same errors, and would make a wrong lens look certain."""
+    rng = np.random.default_rng(0)
+    held, often = (np.repeat(pictures, 40, axis=0) for pictures in (close_up(0.7)[:1], close_up(0.7)))
+    still, moved = (
+        estimate_lens("a", BOARD.corners_m, corners_px + 3 * rng.uniform(-1, 1, (len(corners_px), 1, 2)), (1280, 720))
+        for corners_px in (held, often)
+    )
+    assert still.pictures == 1 and still.reliable_lens is None and moved.pictures == 20
+    assert still.certainty == "1 different pictures of the board where 10 are needed"
+
+
+def test_a_board_has_moved_if_most_of_the_corners_that_two_pictures_share_have() -> None:
+    """Of five corners, the second picture shares three with the first, two of which moved by 10 px; the third shares
+    none."""
+    corners_px = np.zeros((4, 5, 2))
+    corners_px[1, :, 0] = np.nan, np.nan, 10, 10, 0
+    corners_px[2, 2:] = np.nan
+    corners_px[2, :2] = 1e3
+    corners_px[3, 0, 1] = 50  # one of five: still the first
+    assert _moved(corners_px, 10.0) == [0, 1, 2] and _moved(corners_px, 10.1) == [0, 2]
+
+
 def test_a_lens_that_two_radial_terms_cannot_express_gets_a_third() -> None:
     """Without k3, that of a wide lens becomes an error of the other terms."""
     lens = estimate_lens("a", BOARD.corners_m, close_up(0.7, k3=-0.3), (1280, 720)).reliable_lens
@@ -253,7 +276,7 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
         write_cameras(tmp_path, [Lens("a", K, distortion, np.eye(3), np.zeros(3), size_px)], "easymocap")
         calibration = calibrate_from_boards(tmp_path)
         assert calibration.lenses["a"].K[0, 0] == 901 and calibration.lenses["a"].size_px == (1280, 720)
-        assert calibration.intrinsics["a"].startswith("given; not verified by the footage (9 pictures")
+        assert calibration.intrinsics["a"].startswith("given; not verified by the footage (9 different pictures")
     write_cameras(tmp_path, [Lens("a", K, distortion, np.eye(3), np.zeros(3), (640, 360))], "easymocap")
     with pytest.raises(InputError, match="extrinsic/a: is 1280 x 720 px, but its intrinsics are for 640 x 360"):
         calibrate_from_boards(tmp_path)
