@@ -28,6 +28,7 @@ MAX_TILT_DEG = 75.0  # a board tilted further is too slanted to be detected
 MAX_OFF = 0.003  # of an image's longer side, by a camera's median corner: ten times what good footage leaves
 INTRINSICS = ("intri.yml", "camera_array.toml", "calibration.toml")
 WHOLE_CALIBRATIONS = ("sparse", "calibration/Calib*.toml")
+FROM_PERSON = "Calib_person.toml"  # does not say which of its lenses were estimated
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -194,12 +195,14 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
 
 def _given_lenses(folder: Path) -> dict[str, Lens]:
     """Return the lenses of the calibration file in a folder, which need not contain poses; none if there is no such
-    file."""
-    for name in INTRINSICS:
-        path = path_in_capture(folder, name)
-        if path.exists():
-            return read_lenses(path)
-    return recognise(folder).lenses() if any(any(folder.glob(name)) for name in WHOLE_CALIBRATIONS) else {}
+    file. Those that were estimated from the person are left out."""
+    paths = (path_in_capture(folder, name) for name in INTRINSICS)
+    whole = any(path.name != FROM_PERSON for pattern in WHOLE_CALIBRATIONS for path in folder.glob(pattern))
+    if file := next((path for path in paths if path.exists()), None):
+        lenses = read_lenses(file)
+    else:
+        lenses = recognise(folder).lenses() if whole else {}
+    return {name: lens for name, lens in lenses.items() if not lens.estimated}
 
 
 def _compared(found: LensEstimate, given: Lens) -> str:

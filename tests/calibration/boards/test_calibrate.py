@@ -302,6 +302,18 @@ def test_intrinsics_are_read_from_files_without_poses(tmp_path: Path, kind: str)
     assert lenses["cam_7"].K[0, 0] == 900 and words["cam_7"].startswith("given; not verified")
 
 
+@pytest.mark.parametrize("pose2sim", [False, True])
+def test_lenses_estimated_from_the_person_are_not_given_ones(tmp_path: Path, pose2sim: bool) -> None:
+    """They would beat those of the extrinsic footage. Pose2Sim's file has no mark."""
+    K, here = np.diag([500.0, 500, 1]), (np.zeros(5), np.eye(3), np.zeros(3), (1280, 720))
+    lenses = [Lens("a", K, *here, estimated=True), Lens("b", K, *here)]
+    write_calibration(tmp_path, lenses, "person", (), pose2sim)
+    footage = BoardFootage(tmp_path / "extrinsic", BOARD, (0,), 1, {"a": close_up(0.7)}, {"a": (1280, 720)})
+    found, words = calibration_boards._intrinsics(tmp_path, footage)
+    assert found["a"].K[0, 0] == pytest.approx(900, rel=0.005) and words["a"].startswith("from extrinsic/: 20 pictures")
+    assert list(calibration_boards._given_lenses(tmp_path)) == ([] if pose2sim else ["b"])
+
+
 def test_the_board_in_the_ground_frame_defines_the_floor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the last frame the board lies flat under cameras that look down on it, so z must be their height."""
     cameras = rig()
