@@ -23,6 +23,7 @@ from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stdout
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TextIO
 
 from hnerf.errors import InputError
@@ -44,19 +45,22 @@ def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> 
     and prints.
 
     Memory, processor time without progress, and size and number of files are limited. There is no network if the system
-    lets a process give it up. Raises InputError that names the file if a limit ends the process or it crashes,
-    LostWorkerError if it was killed from outside, and the errors of `read`: InputError and OSError unchanged, others as
-    RuntimeError.
+    lets a process give it up. Its temporary files are removed, however it ends. Raises InputError that names the file
+    if a limit ends the process or it crashes, LostWorkerError if it was killed from outside, and the errors of `read`:
+    InputError and OSError unchanged, others as RuntimeError.
     """
     size = int(current_limits().reader_gib * (1 << 30))
     work = pickle.dumps((read, arguments, str(folder), size, limit_s(1)))
-    with subprocess.Popen(
-        [sys.executable, "-m", "tasks.cage", str(os.getpid())],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONSAFEPATH": "1", "MALLOC_ARENA_MAX": "4"},
-        start_new_session=True,
-    ) as reader:
+    with (
+        TemporaryDirectory(prefix="hnerf-", ignore_cleanup_errors=True) as scratch,  # a killed reader leaves its files
+        subprocess.Popen(
+            [sys.executable, "-m", "tasks.cage", str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONSAFEPATH": "1", "MALLOC_ARENA_MAX": "4", "TMPDIR": scratch},
+            start_new_session=True,
+        ) as reader,
+    ):
         try:
             assert reader.stdin is not None and reader.stdout is not None
             reader.stdin.write(work)

@@ -92,6 +92,11 @@ def is_killed(folder: Path) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def is_killed_at_work(folder: Path) -> None:
+    Path(tempfile.mkdtemp(prefix="hnerf-"), "000000.png").write_text("image")
+    is_killed(folder)
+
+
 def reads(folder: Path, out: Path) -> None:
     logging.getLogger("hnerf.capture").warning("%s: of 2 cameras one is black", read_first(folder))
     report("camera 1", 3, 4)
@@ -177,6 +182,15 @@ def test_errors_of_the_machine_are_retryable_and_bugs_have_a_traceback(tmp_path:
 def test_a_reader_has_no_network(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server, pytest.raises(OSError, match="Network is unreachable"):
         run_caged(calls_home, tmp_path, server.getsockname()[1], folder=tmp_path)
+
+
+def test_a_killed_reader_leaves_no_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They may be the images of whole videos."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(LostWorkerError):
+        run_caged(is_killed_at_work, tmp_path, folder=tmp_path)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_stalled_reader_ends_with_its_stage(tmp_path: Path) -> None:
