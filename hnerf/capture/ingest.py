@@ -147,12 +147,13 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, layout: Layout | 
 
 
 def lacks_calibration(folder: Path) -> bool:
-    """Return whether a folder holds recordings of several cameras, and neither their calibration nor footage of a board
-    to calibrate them with."""
+    """Return whether a folder holds recordings of several cameras, of which `capture.toml` names not just one, and
+    neither their calibration nor footage of a board to calibrate them with."""
     known = any(layout.recognises(folder) for layout in LAYOUTS if layout is not Videos)
     if known or path_in_capture(folder, "calibration", "extrinsic").exists():
         return False
-    return folder.is_dir() and len(image_folders_in(folder) or videos_in(folder)) > 1
+    several = folder.is_dir() and len(image_folders_in(folder) or videos_in(folder)) > 1
+    return several and len(cameras_without_calibration(folder)) != 1
 
 
 def exported_lenses(folder: Path) -> list[Lens]:

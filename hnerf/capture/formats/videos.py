@@ -23,9 +23,9 @@ log = logging.getLogger("hnerf.capture")
 
 @dataclass(frozen=True)
 class Videos(EasyMocap):
-    """Videos of a person, with keypoints, masks and clean plates as in the EasyMocap layout. A single video needs no
-    calibration: its camera is taken to be level, with the lens of `intri.yml`, or the field of view that `capture.toml`
-    states. Several need their relative poses."""
+    """Videos of a person, with keypoints, masks and clean plates as in the EasyMocap layout. A single video, or the
+    only one that `capture.toml` names, needs no calibration: its camera is taken to be level, with the lens of
+    `intri.yml`, or the field of view that `capture.toml` states. Several need their relative poses."""
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
@@ -35,20 +35,15 @@ class Videos(EasyMocap):
     def lenses(self) -> dict[str, Lens]:
         """Return the one camera: at the origin, with its lens in `intri.yml`, else the longer side's field of view, and
         Z up."""
-        videos = _videos(self.folder)
-        if len(videos) > 1:
-            raise InputError(
-                f"{self.folder}: {len(videos)} videos without calibration; find their cameras with `hnerf "
-                f"calibrate {self.folder}` from footage of a board, or with --from person"
-            )
-        name, file = _camera_name(videos[0]), self.folder / "intri.yml"
+        video, file = self._video, self.folder / "intri.yml"
+        name = _camera_name(video)
         if self.folder.is_dir() and path_in_capture(self.folder, file.name).exists():
             given = read_intrinsics(file)
             if name not in given:
                 raise InputError(f"{file}: has no camera {name}; give video and camera one name")
             return {name: dataclasses.replace(given[name], R=CAMERA_FROM_Z_UP)}
         stated = read_manifest(self.folder).field_of_view_deg
-        known = lens_by_angle(name, Video(videos[0], (0,), None), stated)
+        known = lens_by_angle(name, Video(video, (0,), None), stated)
         if not known.source:
             log.warning(
                 "%s: no calibration: a camera held level, whose longer side sees %.0f degrees, is assumed; if that is "
@@ -61,7 +56,21 @@ class Videos(EasyMocap):
 
     def footage(self, camera: str) -> Footage:
         """Return the one video."""
-        return Video.open(_videos(self.folder)[0])
+        return Video.open(self._video)
+
+    @property
+    def _video(self) -> Path:
+        """Return the one video, or the one of several that `capture.toml` names. Raises InputError if it names no or
+        several cameras."""
+        videos = _videos(self.folder)
+        if len(videos) > 1 and (split := read_manifest(self.folder).cameras):
+            videos = [video for video in videos if _camera_name(video) in split.train + split.test] or videos
+        if len(videos) > 1:
+            raise InputError(
+                f"{self.folder}: {len(videos)} videos without calibration; find their cameras with `hnerf "
+                f"calibrate {self.folder}` from footage of a board, or with --from person"
+            )
+        return videos[0]
 
 
 def _camera_name(video: Path) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture, SubjectPoint, write_image
-from hnerf.capture.ingest import ingest
+from hnerf.capture.ingest import ingest, lacks_calibration
 from hnerf.config import CaptureSettings
 from hnerf.geometry.axes import CAMERA_FROM_Z_UP
 from tests.capture import recordings as rec
@@ -52,6 +52,19 @@ def test_file_names_given_by_phones_are_accepted(tmp_path: Path, file: str, subj
     write_video(tmp_path / "x.mp4", 3)
     found = ingest((tmp_path / "x.mp4").rename(tmp_path / file), SETTINGS, tmp_path / "out")
     assert found.name == subject and found.train_cameras == (camera,)
+
+
+def test_one_of_several_videos_is_a_capture_if_it_alone_is_named(tmp_path: Path) -> None:
+    """As the refusal of a recording in which no other camera sees the person says."""
+    folder = tmp_path / "film"
+    for name, frames in (("a", 3), ("b", 5)):
+        write_video(folder / f"{name}.mp4", frames)
+    assert lacks_calibration(folder) and "2 videos without calibration" in rec.refusal(folder, tmp_path / "out")
+    (folder / "capture.toml").write_text('[cameras]\ntrain = ["b"]\n')
+    assert not lacks_calibration(folder)
+    found = ingest(folder, SETTINGS, tmp_path / "out")
+    assert found.train_cameras == ("b",) and len(found.frames) == 5
+    np.testing.assert_allclose(found.cameras["b"].R, CAMERA_FROM_Z_UP)
 
 
 def test_a_file_name_that_is_too_long_is_refused(clip: Path, tmp_path: Path) -> None:
