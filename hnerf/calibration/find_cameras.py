@@ -6,8 +6,8 @@ from pathlib import Path
 from hnerf.calibration.clocks.recording import UndeterminedClocksError, synchronise_recording
 from hnerf.calibration.person.recording import calibrate_recording
 from hnerf.capture.clocks import FILE, Clock, read_clocks, write_clocks
-from hnerf.capture.ingest import RATE_TOLERANCE
-from hnerf.capture.manifest import read_manifest
+from hnerf.capture.ingest import RATE_TOLERANCE, check_world_of_person
+from hnerf.capture.manifest import chosen_cameras, read_manifest
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration, image_folders_in
 from hnerf.errors import InputError
 
@@ -19,8 +19,12 @@ def find_missing_cameras(folder: Path, out: Path) -> None:
     unless the cameras are in step.
 
     Images of the same number show the same moment; videos may have started at any time. Clocks and lenses that the
-    folder states are used. Raises InputError if the recording does not determine the rest.
+    folder states are used. Raises InputError if the recording does not determine the rest or, before any work, if
+    `capture.toml` says what ingestion would refuse afterwards.
     """
+    manifest = read_manifest(folder)
+    check_world_of_person(folder, manifest)
+    chosen_cameras(folder, manifest, cameras_without_calibration(folder), [])
     log.warning("%s: no calibration (extri.yml or another): finding cameras from the person takes minutes", folder)
     clocks = read_clocks(folder)
     if not clocks and not image_folders_in(folder):

@@ -207,18 +207,31 @@ def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
     is not the vertical axis of the layout's own world.
     """
     manifest = read_manifest(folder)
-    if isinstance(layout, PeopleSnapshot | Videos | FromPerson) and manifest.up != "z":
-        raise InputError(f"{folder / 'capture.toml'}: up: without a calibration, Z is up; remove the line")
-    if isinstance(layout, FromPerson) and manifest.metres_per_unit != 1:
-        raise InputError(
-            f"{folder / 'capture.toml'}: units: cameras found from the person are in metres; remove the line"
-        )
+    if isinstance(layout, FromPerson):
+        check_world_of_person(folder, manifest)
+    if isinstance(layout, PeopleSnapshot | Videos):
+        _check_z_up(folder, manifest)
     if not isinstance(layout, Uncalibrated):
         return manifest
     dropped = {"cameras"} | ({"frames"} if layout.only else set())
     if (point := manifest.subject_point) and (not point.camera or layout.only not in (None, point.camera)):
         dropped.add("subject")
     return manifest.model_copy(update=dict.fromkeys(dropped))
+
+
+def check_world_of_person(folder: Path, manifest: CaptureManifest) -> None:
+    """Raise InputError if `capture.toml` states another world than that of cameras found from the person: Z up, in
+    metres."""
+    _check_z_up(folder, manifest)
+    if manifest.metres_per_unit != 1:
+        raise InputError(
+            f"{folder / 'capture.toml'}: units: cameras found from the person are in metres; remove the line"
+        )
+
+
+def _check_z_up(folder: Path, manifest: CaptureManifest) -> None:
+    if manifest.up != "z":
+        raise InputError(f"{folder / 'capture.toml'}: up: without a calibration, Z is up; remove the line")
 
 
 def _warn_of_hdr(filmed: dict[str, Footage]) -> None:

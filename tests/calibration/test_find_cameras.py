@@ -153,6 +153,26 @@ def test_a_point_in_a_video_needs_clocks(tmp_path: Path, calibrated_with: list[A
     assert calibrated_with == [{"a": Clock(), "b": Clock()}]
 
 
+@pytest.mark.parametrize(
+    ("toml", "refused"),
+    [
+        ('up = "y"', "up: without a calibration, Z is up; remove the line"),
+        ('units = "mm"', "units: cameras found from the person are in metres; remove the line"),
+        ('[cameras]\ntrain = ["a", "b", "c"]', r"camera c is not in the calibration; correct \[cameras\]"),
+    ],
+)
+def test_what_ingestion_would_refuse_is_refused_before_cameras_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calibrated_with: list[Any], toml: str, refused: str
+) -> None:
+    """Finding them takes minutes, and again after `capture.toml` is corrected."""
+    monkeypatch.setattr(module, "synchronise_recording", Mock(side_effect=AssertionError))
+    folder = film(tmp_path / "film", 3, 3)
+    (folder / "capture.toml").write_text(toml)
+    with pytest.raises(InputError, match=rf"capture\.toml: {refused}$"):
+        find_missing_cameras(folder, tmp_path / "out")
+    assert not calibrated_with
+
+
 def test_ground_truth_is_refused_without_a_calibration(tmp_path: Path) -> None:
     folder = film(tmp_path / "film", 3, 3)
     (folder / "ground_truth").mkdir()
