@@ -8,7 +8,7 @@ from tasks.source import Source
 from tasks.stage import stage
 
 
-@stage("cameras", version="1")
+@stage("cameras", version="2")
 def find_cameras(out: Path, source: Source) -> dict[str, float]:
     """Find the clocks and cameras of a recording from the person it shows."""
     from hnerf.calibration.find_cameras import find_missing_cameras  # importing this takes a second

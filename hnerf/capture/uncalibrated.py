@@ -115,6 +115,14 @@ class Uncalibrated(Layout):
         """Return openpose/<camera>/, else pose/<camera>_json/."""
         return EasyMocap(self.folder).keypoint_files(camera)
 
+    def mask_files(self, camera: str) -> dict[int, StoredFrame]:
+        """Return masks/<camera>/ or mask/, which give outlines; none if one camera is read alone, for its clock."""
+        return {} if self.only else EasyMocap(self.folder).mask_files(camera)
+
+    def plate_file(self, camera: str) -> Path | None:
+        """Return background/<camera>.jpg or .png, with which outlines are found; none if one camera is read alone."""
+        return None if self.only else EasyMocap(self.folder).plate_file(camera)
+
 
 def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLens:
     """Return a lens without distortion, at the origin, whose field of view across the longer side is the given one,

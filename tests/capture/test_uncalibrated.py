@@ -185,6 +185,18 @@ def test_settings_that_need_other_cameras_or_the_ground_are_ignored(
     assert capture.subject_point == point and len(capture.frames) == (4 if only == "02" else 5)
 
 
+@pytest.mark.parametrize("only", [None, "02"])
+def test_given_masks_and_clean_plates_are_read_without_calibration(tmp_path: Path, only: str | None) -> None:
+    """The person's outlines refine cameras found from the person. A camera's clock needs none."""
+    folder = write_easymocap(tmp_path / "ada")
+    for frame in range(5):
+        write_image(folder / "masks" / "02" / f"{frame}.png", np.full((16, 24), 255, np.uint8))
+    write_image(folder / "background" / "02.png", np.full((16, 24, 3), 9, np.uint8))
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder, only=only))
+    mask, plate = capture.given_mask("02", 3), capture.background("02")
+    assert (mask is not None and mask.all()) == (plate is not None and (plate == 9).all()) == (only is None)
+
+
 def test_board_footage_is_not_read_without_calibration(tmp_path: Path) -> None:
     """Cameras are read one by one, and the board would be searched for again each time."""
     folder = write_easymocap(tmp_path / "ada")
