@@ -1,5 +1,6 @@
 """Detection of people in the training images of a capture: keypoints, landmarks in metres and soft masks."""
 
+import dataclasses
 import multiprocessing
 import os
 import signal
@@ -45,9 +46,10 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     give identical files.
 
     Cameras are distributed over as many processes as there are cores. Cameras whose landmarks are in `out` already are
-    not processed again. Test cameras are never read. Masks show the subject only; keypoints are of all people, from
-    whom `hnerf.capture.subject` chooses the subject. Raises InputError if a network is missing, nobody is found in any
-    image, the subject is ambiguous, or the subject is too small or always cut off.
+    not processed again. Test cameras are never read, nor are training cameras of the capture's files that `capture`
+    lacks. Masks show the subject only; keypoints are of all people, from whom `hnerf.capture.subject` chooses the
+    subject. Raises InputError if a network is missing, nobody is found in any image, the subject is ambiguous, or the
+    subject is too small or always cut off.
     """
     for name in (POSE_DETECTOR, f"pose_landmark_{settings.size}.tflite"):
         model_file(name)
@@ -77,8 +79,9 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     ranked = ranked_people(detected)
     if alone:  # a recording's own keypoints may lack hidden parts
         check_subject(capture, ranked[0])
-    for name, subject in zip(capture.train_cameras, ranked[0].keypoints, strict=True):
-        keep_subject(out, capture, name, subject, people[name], _load(out, name, "masks", "regions"))
+    subjects = dict(zip(detected.train_cameras, ranked[0].keypoints, strict=True))
+    for name in capture.train_cameras:
+        keep_subject(out, capture, name, subjects[name], people[name], _load(out, name, "masks", "regions"))
     draw_people(out / PICTURE, detected, ranked)
     report = {"cameras": {name: _summary(people) for name, people in found.items()}, "people": people_rows(ranked)}
     write_result(out / REPORT, DetectionReport, report)
@@ -86,10 +89,12 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
 
 
 def with_keypoints(capture: Capture, out: Path) -> Capture:
-    """Return the capture if it has keypoints, else a copy in `out` with keypoints from the network."""
-    if capture.has_keypoints:
+    """Return the capture if all training cameras have keypoints, else a copy in `out` with keypoints from the network
+    for those that have none."""
+    without = tuple(name for name in capture.train_cameras if capture.keypoints(name) is None)
+    if not without:
         return capture
-    detect(capture, DetectionSettings(), out)
+    detect(dataclasses.replace(capture, train_cameras=without), DetectionSettings(), out)
     return Capture.load(out)
 
 

@@ -1,5 +1,6 @@
 """Detection adds keypoints to a capture without any; tested on the shared capture too if the networks are installed."""
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -16,7 +17,7 @@ from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, DetectionSettings
 from hnerf.detection import detect as module
-from hnerf.detection.detect import detect
+from hnerf.detection.detect import detect, with_keypoints
 from hnerf.errors import InputError
 from hnerf.models import SHA256, has_model
 from tests.calibration.synthetic import edited_keypoints
@@ -53,6 +54,19 @@ def test_with_source_both_the_recordings_own_keypoints_are_kept_and_completed(
     kept = Capture.load(tmp_path / "out").keypoints("01")
     assert kept is not None and kept.shape == (5, 1, 25, 3)
     assert kept[:, 0, 11].tolist() == [[5, 4, 0.5]] * 5 and (np.delete(kept, 11, 2) == [5, 4, 0.9]).all()
+
+
+def test_only_cameras_without_keypoints_get_those_of_the_network(recording: Capture, tmp_path: Path) -> None:
+    """As when cameras are found from the person, where `detection.source` has no effect."""
+    both = dataclasses.replace(recording, train_cameras=("01", "02"), test_cameras=())
+    both.save()
+    assert with_keypoints(both, tmp_path / "out") is both
+    with edited_keypoints(recording.root) as own:
+        del own["02"]
+    found = with_keypoints(both, tmp_path / "out")
+    kept, added = found.keypoints("01"), found.keypoints("02")
+    assert kept is not None and np.array_equal(kept, own["01"]) and MadeUp.seen == 5
+    assert added is not None and added[:, 0, 1].tolist() == [[5, 4, 0.5]] * 5
 
 
 def test_recorded_hands_are_kept_with_the_recorded_people_only(recording: Capture, tmp_path: Path) -> None:
