@@ -146,11 +146,15 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, layout: Layout | 
     return capture
 
 
+def has_calibration(folder: Path) -> bool:
+    """Return whether a folder holds a calibration of its cameras, readable or not."""
+    return any(layout.recognises(folder) for layout in LAYOUTS if layout is not Videos)
+
+
 def lacks_calibration(folder: Path) -> bool:
     """Return whether a folder holds recordings of several cameras, of which `capture.toml` names not just one, and
     neither their calibration nor footage of a board to calibrate them with."""
-    known = any(layout.recognises(folder) for layout in LAYOUTS if layout is not Videos)
-    if known or path_in_capture(folder, "calibration", "extrinsic").exists():
+    if has_calibration(folder) or path_in_capture(folder, "calibration", "extrinsic").exists():
         return False
     several = folder.is_dir() and len(image_folders_in(folder) or videos_in(folder)) > 1
     return several and len(cameras_without_calibration(folder)) != 1

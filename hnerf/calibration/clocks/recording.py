@@ -1,5 +1,6 @@
 """Synchronisation of the recordings in a capture's folder: keypoints and sound of each camera, and their clocks."""
 
+import logging
 import tempfile
 from itertools import combinations
 from pathlib import Path
@@ -11,7 +12,7 @@ from hnerf.calibration.clocks.keypoints import Track
 from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.capture.clocks import frame_times_s
 from hnerf.capture.footage import Video
-from hnerf.capture.ingest import DEFAULT_FPS, ingest, lens_as_recorded, recognise
+from hnerf.capture.ingest import DEFAULT_FPS, has_calibration, ingest, lens_as_recorded, recognise
 from hnerf.capture.lens import Lens, undistort_keypoints
 from hnerf.capture.manifest import read_manifest
 from hnerf.capture.subject import subject_keypoints
@@ -22,6 +23,8 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MAX_FRAMES = 20_000  # of a camera: eleven minutes at 30 frames a second; of more, every second or third is used
+
+log = logging.getLogger("hnerf.calibration")
 
 
 class UndeterminedClocksError(InputError):
@@ -77,9 +80,16 @@ def _track(alone: Uncalibrated, name: str, fps: float, lens: Lens | None, scratc
 
 
 def _calibration(folder: Path, names: list[str]) -> dict[str, Lens]:
-    """Return the lenses of the folder's calibration; empty if there is none, or if it lacks a camera."""
+    """Return the lenses of the folder's calibration; empty if there is none or, with a warning, if it cannot be read or
+    lacks a camera."""
+    if not has_calibration(folder):
+        return {}
     try:
         lenses = recognise(folder).lenses()
-    except InputError:
+    except InputError as error:
+        log.warning("%s; clocks are found without a calibration", error)
         return {}
-    return {} if set(names).difference(lenses) else lenses
+    if missing := sorted(set(names).difference(lenses)):
+        log.warning("%s: its calibration lacks camera %s; clocks are found without it", folder, ", ".join(missing))
+        return {}
+    return lenses

@@ -1,9 +1,11 @@
 """The commands that make calibration files and clocks from a folder of images and keypoint files."""
 
 import json
+import logging
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -118,6 +120,30 @@ def test_cameras_recorded_in_black_bars_are_synchronised_with_the_lens_of_what_t
     monkeypatch.setattr(recording, "estimate_clocks", lambda _, cameras, __: used.update(cameras))
     synchronise_recording(folder)
     assert [camera.K[1, 2] for camera in used.values()] == pytest.approx([31.5, 31.5], abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "warning"),
+    [
+        ("matrix =", "matrices =", "Calib.toml: camera cam01: 'matrix' is missing; calibrate again; clocks are found"),
+        ('name = "cam02"', 'name = "other"', "film: its calibration lacks camera cam02; clocks are found without it"),
+        ("[metadata]", "[metadata]", ""),
+    ],
+)
+def test_a_calibration_that_clocks_cannot_use_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, old: str, new: str, warning: str
+) -> None:
+    """Otherwise the person is asked to wave, though the file is at fault."""
+    folder = rec.write_pose2sim(tmp_path / "film")
+    calibration = folder / "calibration" / "Calib.toml"
+    calibration.write_text(calibration.read_text().replace(old, new))
+    used = Mock()
+    monkeypatch.setattr(recording, "_track", lambda *_: None)
+    monkeypatch.setattr(recording, "estimate_clocks", used)
+    synchronise_recording(folder)
+    assert (used.call_args.args[1] is None) == bool(warning)
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(warnings) == bool(warning) and all(warning in one for one in warnings)
 
 
 def test_tracks_are_in_pixels_of_the_recorded_images(tmp_path: Path) -> None:
