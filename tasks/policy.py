@@ -86,7 +86,7 @@ class StorePolicy(CachePolicy):
         record = f"{task.name}-{key}-{place}"
         results = task_ctx.result_store
         if results.exists(record) and results.read(record).result != store.find(task.name, key):
-            (PREFECT_RESULTS_LOCAL_STORAGE_PATH.value() / record).unlink()
+            (PREFECT_RESULTS_LOCAL_STORAGE_PATH.value() / record).unlink(missing_ok=True)  # another run may have
         return record
 
 

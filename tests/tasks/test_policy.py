@@ -1,6 +1,7 @@
 import errno
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from prefect.states import Failed
@@ -15,8 +16,9 @@ from hnerf.config import (
     TrainingSettings,
 )
 from hnerf.errors import InputError
+from tasks.bucket import VARIABLE
 from tasks.launcher import LostWorkerError
-from tasks.policy import is_transient, stage_key
+from tasks.policy import StorePolicy, is_transient, stage_key
 from tasks.source import Source
 from tasks.store import Artifact, StoredFile
 
@@ -32,6 +34,17 @@ def source(digest: str = "d", name: str = "ada", root: str = "/here/ada") -> Sou
 def key(task: str = "fit", version: str = "1", **changed: Any) -> str:
     inputs: dict[str, Any] = {"source": source(), "body": artifact(), "settings": CaptureSettings(), "rough": None}
     return stage_key(task, version, inputs | {"several": (artifact(), artifact("b"))} | changed)
+
+
+def test_a_stale_record_may_be_dropped_by_another_run_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Here it is gone when this run removes it."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setattr("tasks.policy.PREFECT_RESULTS_LOCAL_STORAGE_PATH", Mock(value=lambda: tmp_path))
+    context, store = Mock(), Mock(root=tmp_path)
+    context.task.name, context.task.version = "fit", "1"
+    context.result_store.exists.return_value = True
+    record = StorePolicy().compute_key(context, {"store": store, "inputs": {"source": source()}}, {})
+    assert record is not None and record.startswith("fit-")
 
 
 @pytest.mark.parametrize(
