@@ -66,6 +66,7 @@ class PeopleSnapshot(Layout):
             return {}
         count = self._one_a_frame(path, "keypoints")
         found = _array(path, "keypoints", (3 * COCO_POINTS,)).reshape(count, 1, COCO_POINTS, 3)
+        found[..., 2] = found[..., 2].clip(0, 1)  # as those of keypoint files
         return {i: StoredFrame(path, path, points.copy) for i, points in enumerate(without_far_points(path, found))}
 
     def mask_files(self, camera: str) -> dict[int, StoredFrame]:

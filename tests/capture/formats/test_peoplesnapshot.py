@@ -86,6 +86,13 @@ def test_given_poses_are_aligned_from_the_end(capture: Capture) -> None:
     assert given.betas.tolist() == list(range(10))
 
 
+def test_confidences_beyond_0_to_1_are_clipped(folder: Path) -> None:
+    """As in all other layouts."""
+    write_hdf5(folder / "keypoints.hdf5", keypoints=np.tile([5.0, 5.0, 1.5, 5.0, 5.0, -0.5], (6, 9)))
+    (people,) = PeopleSnapshot(folder).keypoint_files("camera")[0].read()
+    assert people[:2, 2].tolist() == [1, 0]
+
+
 @pytest.mark.parametrize("name", ["masks", "keypoints"])
 def test_more_rows_than_frames_are_refused_before_they_are_read(name: str, folder: Path, tmp_path: Path) -> None:
     """A few kilobytes declare four billion rows; a dictionary of them would fill any memory."""
