@@ -66,13 +66,15 @@ class Uncalibrated(Layout):
     """A recording whose camera poses are unknown: all cameras are at the origin.
 
     lens_file: intrinsics, in `intri.yml` or in a TOML of cameras; fov_deg: field of view of all other cameras, across
-    the longer side; only: the one camera to read, else all; found_clocks: used instead of those in the folder.
+    the longer side; only: the one camera to read, else all; found_clocks: used instead of those in the folder;
+    calibrated: the layout in which the folder is read with its calibration, if that is known, else EasyMocap's.
     """
 
     lens_file: Path | None = None
     fov_deg: float | None = None
     only: str | None = None
     found_clocks: Mapping[str, Clock] | None = None
+    calibrated: Layout | None = None
 
     @cached_property
     def known_lenses(self) -> dict[str, KnownLens]:
@@ -101,10 +103,14 @@ class Uncalibrated(Layout):
         return super().clocks() if self.found_clocks is None else dict(self.found_clocks)
 
     def footage(self, camera: str) -> Footage:
-        """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""
+        """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4; in Pose2Sim's layout, videos first."""
         if camera not in self._opened:
-            self._opened[camera] = EasyMocap(self.folder).footage(camera)
+            self._opened[camera] = self._files.footage(camera)
         return self._opened[camera]
+
+    @property
+    def _files(self) -> Layout:
+        return self.calibrated or EasyMocap(self.folder)
 
     @cached_property
     def _opened(self) -> dict[str, Footage]:
@@ -113,15 +119,15 @@ class Uncalibrated(Layout):
 
     def keypoint_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return openpose/<camera>/, else pose/<camera>_json/."""
-        return EasyMocap(self.folder).keypoint_files(camera)
+        return self._files.keypoint_files(camera)
 
     def mask_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return masks/<camera>/ or mask/, which give outlines; none if one camera is read alone, for its clock."""
-        return {} if self.only else EasyMocap(self.folder).mask_files(camera)
+        return {} if self.only else self._files.mask_files(camera)
 
     def plate_file(self, camera: str) -> Path | None:
         """Return background/<camera>.jpg or .png, with which outlines are found; none if one camera is read alone."""
-        return None if self.only else EasyMocap(self.folder).plate_file(camera)
+        return None if self.only else self._files.plate_file(camera)
 
 
 def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLens:

@@ -12,6 +12,7 @@ from hnerf.calibration.clocks.keypoints import Track
 from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.capture.clocks import frame_times_s
 from hnerf.capture.footage import Video
+from hnerf.capture.formats.layout import Layout
 from hnerf.capture.ingest import DEFAULT_FPS, has_calibration, ingest, lens_as_recorded, recognise
 from hnerf.capture.lens import Lens, undistort_keypoints
 from hnerf.capture.manifest import read_manifest
@@ -42,9 +43,10 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
     if not names:
         raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to synchronise; add the recordings")
     fps = read_manifest(folder).fps or DEFAULT_FPS
-    lenses, tracks, sounds = _calibration(folder, names), dict[str, Track](), dict[str, np.ndarray]()
+    layout, lenses = _calibration(folder, names)
+    tracks, sounds = dict[str, Track](), dict[str, np.ndarray]()
     for name in names:
-        alone = Uncalibrated(folder, only=name)
+        alone = Uncalibrated(folder, only=name, calibrated=layout)
         footage = alone.footage(name)
         if name in lenses:
             lenses[name] = lens_as_recorded(lenses[name], footage, footage.frames)[0]
@@ -79,17 +81,18 @@ def _track(alone: Uncalibrated, name: str, fps: float, lens: Lens | None, scratc
     return Track(frame_times_s(footage, fps)[rows], keypoints)
 
 
-def _calibration(folder: Path, names: list[str]) -> dict[str, Lens]:
-    """Return the lenses of the folder's calibration; empty if there is none or, with a warning, if it cannot be read or
-    lacks a camera."""
+def _calibration(folder: Path, names: list[str]) -> tuple[Layout | None, dict[str, Lens]]:
+    """Return the layout of the folder with its calibration, and its lenses; neither if there is no calibration or, with
+    a warning, if it cannot be read or lacks a camera."""
     if not has_calibration(folder):
-        return {}
+        return None, {}
     try:
-        lenses = recognise(folder).lenses()
+        layout = recognise(folder)
+        lenses = layout.lenses()
     except InputError as error:
         log.warning("%s; clocks are found without a calibration", error)
-        return {}
+        return None, {}
     if missing := sorted(set(names).difference(lenses)):
         log.warning("%s: its calibration lacks camera %s; clocks are found without it", folder, ", ".join(missing))
-        return {}
-    return lenses
+        return None, {}
+    return layout, lenses

@@ -16,6 +16,7 @@ from hnerf.calibration.bundle import align
 from hnerf.calibration.clocks import recording
 from hnerf.calibration.clocks.recording import _track, synchronise_recording
 from hnerf.calibration.silhouettes import Outlines
+from hnerf.capture.capture import write_image
 from hnerf.capture.clocks import read_clocks
 from hnerf.capture.formats.easymocap import EasyMocap, write_easymocap
 from hnerf.capture.formats.pose2sim import Pose2Sim
@@ -115,6 +116,7 @@ def test_cameras_recorded_in_black_bars_are_synchronised_with_the_lens_of_what_t
         (folder / "images" / video.stem).mkdir(parents=True)
         for frame in range(10):
             Image.fromarray(barred).save(folder / "images" / video.stem / f"{frame:06d}.png")
+    (folder / "videos").rmdir()
     used: dict[str, Camera] = {}
     monkeypatch.setattr(recording, "_track", lambda *_: None)
     monkeypatch.setattr(recording, "estimate_clocks", lambda _, cameras, __: used.update(cameras))
@@ -144,6 +146,24 @@ def test_a_calibration_that_clocks_cannot_use_is_a_warning(
     assert (used.call_args.args[1] is None) == bool(warning)
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(warnings) == bool(warning) and all(warning in one for one in warnings)
+
+
+def test_clocks_are_of_the_footage_that_the_calibrated_capture_is_read_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pose2Sim's layout reads videos even if there are images, whose frame rate is not known."""
+    folder = rec.write_pose2sim(tmp_path / "film")
+    for name in ("cam01", "cam02"):
+        write_image(folder / "images" / name / "000000.png", np.zeros((48, 64, 3), np.uint8))
+    read = dict[str, tuple[Path, int]]()
+
+    def track(alone: Uncalibrated, name: str, *_: object) -> None:
+        read[name] = alone.footage(name).path, len(alone.keypoint_files(name))
+
+    monkeypatch.setattr(recording, "_track", track)
+    monkeypatch.setattr(recording, "estimate_clocks", Mock())
+    synchronise_recording(folder)
+    assert read == {name: (folder / "videos" / f"{name}.mp4", 10) for name in ("cam01", "cam02")}
 
 
 def test_tracks_are_in_pixels_of_the_recorded_images(tmp_path: Path) -> None:
