@@ -1,5 +1,6 @@
 """A subject as one file: the artifacts of its latest results, packed (tasks/packed.py), and its links."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 from uuid import uuid4
@@ -34,14 +35,14 @@ class Manifest(Contents):
 
 def export_subject(store: Store, subject: str, out: Path) -> Manifest:
     """Write a subject's latest artifacts, with all artifacts that they were computed from, into a new file. Raises
-    InputError if there is no such subject, an artifact is damaged, or `out` exists."""
+    InputError if there is no such subject, an artifact is damaged or missing, or `out` exists."""
     if out.exists():
         raise InputError(f"{out}: exists; give the name of a new file")
     inventory = Inventory.of(store)
-    latest = {stage: name for stage, name in inventory.latest.get(subject, {}).items() if name in inventory.stored}
+    latest = inventory.latest.get(subject, {})
     if not latest:
         raise InputError(f"{store.subject_folder(subject)}: no results; `hnerf store list` names the subjects")
-    artifacts = [_intact(store, *name.split("/")) for name in sorted(inventory.with_inputs(latest.values()))]
+    artifacts = [_intact(store, *name.split("/")) for name in sorted(_needed(inventory, latest.values()))]
     described = {"subject": subject, "recording": store.recording(subject), "latest": latest}
     manifest = validated(Manifest, {**described, "artifacts": archived(artifacts)}, store.subject_folder(subject))
     with made_folder(out.parent), atomic_file(out) as beside:
@@ -74,6 +75,16 @@ def import_subject(store: Store, path: Path) -> Manifest:
         for stage in sorted(manifest.latest, key=STAGES.index):
             store.link_latest(manifest.subject, _intact(store, *manifest.latest[stage].split("/")))
     return manifest
+
+
+def _needed(inventory: Inventory, latest: Collection[str]) -> set[str]:
+    """Return these artifacts and all that they were computed from, damaged ones, too. Without inputs that were never in
+    this store: what came from a bucket may have been computed from equal ones under other keys."""
+    stored = inventory.with_inputs(latest)
+    inputs = {name for one in stored for name in inventory.stored[one].artifact.inputs}
+    paths = {name: inventory.store.path(*name.split("/")) for name in inputs - stored}
+    left = {name for name, path in paths.items() if path.exists() or path.with_suffix(".json").exists()}
+    return {*latest, *stored, *left}
 
 
 def _intact(store: Store, stage: str, key: str) -> Artifact:

@@ -134,6 +134,25 @@ def test_damaged_artifacts_are_not_exported(packed: Path, tmp_path: Path) -> Non
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ada.tar", "from"]
 
 
+@pytest.mark.parametrize("lost", ["training/{:032x}.json", "fit/{:032x}.json", "fit/{:032x}"])
+def test_a_subject_that_lacks_a_result_or_an_input_is_not_exported(packed: Path, tmp_path: Path, lost: str) -> None:
+    """A linked training and the rough fit, which has no link, without a readable record or without files."""
+    store = Store(tmp_path / "from")
+    path = store.root / lost.format(13 if lost.startswith("training") else 11)
+    path.write_text("{") if path.is_file() else shutil.rmtree(path)
+    with pytest.raises(InputError, match=rf"{path.with_suffix('')}: damaged; repeat the same `hnerf run`"):
+        export_subject(store, "ada", tmp_path / "again.tar")
+    assert not (tmp_path / "again.tar").exists()
+
+
+def test_inputs_that_were_never_in_this_store_are_left_out(packed: Path, tmp_path: Path) -> None:
+    """Another machine computed the training from an equal fit under another key, and shared it through a bucket."""
+    store = Store(tmp_path / "from")
+    for path in (store.path("fit", f"{11:032x}"), store.path("fit", f"{11:032x}", ".json")):
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+    assert f"fit/{11:032x}" not in export_subject(store, "ada", tmp_path / "again.tar").artifacts
+
+
 def repack(path: Path, members: list[tuple[str, bytes]], **changes: Any) -> None:
     with tarfile.open(path, "w", format=tarfile.GNU_FORMAT) as archive:
         for name, content in members:
