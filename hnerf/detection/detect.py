@@ -3,7 +3,6 @@
 import dataclasses
 import multiprocessing
 import os
-import signal
 import time
 import zlib
 from collections.abc import Callable
@@ -31,7 +30,7 @@ from hnerf.detection.tracker import track
 from hnerf.errors import InputError
 from hnerf.files import copy_folder
 from hnerf.models import POSE_DETECTOR, model_file
-from hnerf.processes import end_with_parent
+from hnerf.processes import begin_worker
 from hnerf.progress import report as report_progress
 from hnerf.progress import tracked
 from hnerf.results.files import write_result
@@ -116,8 +115,7 @@ def _find_people(capture: Capture, settings: DetectionSettings, out: Path) -> di
         return {name: find_in_camera(capture, name, settings, out) for name in waiting}
     processes = min(len(waiting), len(os.sched_getaffinity(0)))
     spawn = multiprocessing.get_context("spawn")
-    ends = (signal.SIGKILL, os.getpid())
-    with ProcessPoolExecutor(processes, spawn, initializer=end_with_parent, initargs=ends) as pool:
+    with ProcessPoolExecutor(processes, spawn, initializer=begin_worker, initargs=(os.getpid(),)) as pool:
         jobs = {pool.submit(find_in_camera, capture, name, settings, out): name for name in waiting}
         running = set(jobs)
         try:

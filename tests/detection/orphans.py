@@ -1,6 +1,7 @@
 """A detection whose networks never return, for tests: python -m tests.detection.orphans FOLDER."""
 
 import os
+import resource
 import signal
 import sys
 import time
@@ -16,6 +17,11 @@ def never(capture: Any, camera: str, settings: DetectionSettings, out: Path) -> 
     """Create a file named after the process id, then sleep."""
     (out / str(os.getpid())).touch()
     time.sleep(100)
+
+
+def processor_limits_s(capture: Any, camera: str, settings: DetectionSettings, out: Path) -> tuple[int, int]:
+    """Return a worker's soft and hard limit of processor time."""
+    return resource.getrlimit(resource.RLIMIT_CPU)
 
 
 if __name__ == "__main__":

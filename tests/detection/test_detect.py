@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -9,6 +10,8 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +26,7 @@ from hnerf.models import SHA256, has_model
 from tests.calibration.synthetic import edited_keypoints
 from tests.capture.recordings import write_easymocap
 from tests.detection.made_up import MadeUp
+from tests.detection.orphans import processor_limits_s
 from tests.shared_data import shared_capture
 
 NETWORK, BOTH = DetectionSettings(source="network"), DetectionSettings(source="both")
@@ -165,3 +169,18 @@ def test_no_worker_outlives_a_stage_that_is_killed_or_interrupted(how: signal.Si
     while any(Path(f"/proc/{worker}/exe").exists() for worker in workers):
         assert time.monotonic() < deadline, f"{workers} are still running"
         time.sleep(0.05)
+
+
+def test_workers_do_not_keep_the_processor_time_that_a_reader_had_when_they_began(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reader's own progress raises its limit, but not that of its workers, which it would kill in the end."""
+    monkeypatch.setattr(module, "find_in_camera", processor_limits_s)
+    cameras: Any = SimpleNamespace(train_cameras=("01", "02"), frames=(0,))
+    before = _, hard_s = resource.getrlimit(resource.RLIMIT_CPU)
+    resource.setrlimit(resource.RLIMIT_CPU, (100_000, hard_s))
+    try:
+        found: Any = module._find_people(cameras, NETWORK, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_CPU, before)
+    assert found == dict.fromkeys(("01", "02"), (hard_s, hard_s))
