@@ -9,7 +9,7 @@ from prefect import flow
 from pydantic import Field
 
 from flows.arguments import StoreFolder
-from flows.preparation import Prepared, ingest_part, ingest_recording, prepare_training
+from flows.preparation import Prepared, ingest_part, ingest_recording, prepare_training, refuse_held_out_cameras
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, title_of
@@ -54,11 +54,12 @@ def benchmark(
     """
     whole = load_study(study)
     plan = whole.restricted_to(methods or [], seconds)
-    first, *_ = [plan.settings(name) for name in plan.methods]  # invalid presets are refused first
-    set_limits(first.limits)
+    presets = [plan.settings(name) for name in plan.methods]  # invalid presets are refused first
+    refuse_held_out_cameras(presets)
+    set_limits(presets[0].limits)
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    recorded = Capture.load(ingest_recording(artifact_store, source, first).root)
+    recorded = Capture.load(ingest_recording(artifact_store, source, presets[0]).root)
     if plan.until_flat and not (recorded.test_cameras and truth_of(truth.root, recorded).has_masks):
         raise InputError(
             f"{recorded.name}: no image can be scored, so no curve can become flat; add test cameras with masks, or "

@@ -1,5 +1,6 @@
 """The stages before training, which `train-subject` and the studies have in common."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from hnerf.capture.capture import Capture
@@ -25,6 +26,12 @@ class Prepared(NamedTuple):
     calibration: Artifact
     segmentation: Artifact
     body: Artifact
+
+
+def refuse_held_out_cameras(presets: Iterable[Settings]) -> None:
+    """Raise InputError if a preset of a study leaves a camera out: studies would train with it all the same."""
+    if any(preset.evaluation.holdout is not None for preset in presets):
+        raise InputError("evaluation.holdout: only `hnerf run` leaves cameras out; remove it")
 
 
 def missing_cameras(store: Store, source: Source) -> Artifact | None:
