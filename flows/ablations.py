@@ -25,6 +25,7 @@ from tasks.evaluation import evaluate
 from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
 from tasks.source import Source, read_capture
+from tasks.stage import retried
 from tasks.store import Store
 from tasks.training import train
 
@@ -60,7 +61,7 @@ def ablate(
     rows, left_out = choose(load_settings(preset, overrides), only)
     set_limits(rows[FULL].limits)
     artifact_store = Store(store.resolve())
-    source, truth = read_capture(capture, store)
+    source, truth = retried(read_capture)(capture, store)
     subject = Capture.load(ingest_recording(artifact_store, source, rows[FULL]).root).name
     table = artifact_store.root / "ablations" / f"{subject}-{title_of(preset)}{'-part' if only else ''}.md"
     artifact_store.claim_table(table, source.digest, source.root)

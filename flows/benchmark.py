@@ -24,6 +24,7 @@ from tasks.calibration import calibrated_capture
 from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
 from tasks.source import GROUND_TRUTH, Source, read_capture
+from tasks.stage import retried
 from tasks.store import Store
 from tasks.training import train
 
@@ -58,7 +59,7 @@ def benchmark(
     refuse_held_out_cameras(presets)
     set_limits(presets[0].limits)
     artifact_store = Store(store.resolve())
-    source, truth = read_capture(capture, store)
+    source, truth = retried(read_capture)(capture, store)
     recorded = Capture.load(ingest_recording(artifact_store, source, presets[0]).root)
     if plan.until_flat and not (recorded.test_cameras and truth_of(truth.root, recorded).has_masks):
         raise InputError(

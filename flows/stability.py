@@ -30,6 +30,7 @@ from tasks.evaluation import evaluate
 from tasks.fit import fit
 from tasks.policy import is_of_the_machine
 from tasks.source import Source, read_capture
+from tasks.stage import retried
 from tasks.store import Artifact, Store
 from tasks.study import (
     check_meshes,
@@ -76,7 +77,7 @@ def stability(
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
     refuse_held_out_cameras(presets.values())
     artifact_store = Store(store.resolve())
-    source, truth = read_capture(capture, store)
+    source, truth = retried(read_capture)(capture, store)
     subject = Capture.load(ingest_part(artifact_store, source, plan.part, next(iter(presets.values()))).root).name
     table = artifact_store.root / "stability" / f"{subject}-{title_of(study)}{'' if plan == whole else '-part'}.md"
     artifact_store.claim_table(table, source.digest, source.root)

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -197,7 +198,7 @@ def test_the_page_of_the_flow_run_shows_the_table(
     stages: list[TrainingSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
-    monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(run_page, "FlowRunContext", Mock())
     monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
     table = ablate.fn(tmp_path, store=tmp_path / "store", only=["no-opt"])
     assert shown == [table.read_text()]

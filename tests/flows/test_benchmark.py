@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -309,7 +310,7 @@ def test_the_page_of_the_flow_run_embeds_the_charts(
     study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
-    monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(run_page, "FlowRunContext", Mock())
     monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
     table = benchmark.fn(tmp_path, study, ["demo"], store=tmp_path / "store")
     chart = base64.b64encode(table.with_suffix(".png").read_bytes()).decode()

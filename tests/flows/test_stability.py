@@ -187,7 +187,7 @@ def test_runs_are_compared_on_the_images_and_surfaces_that_both_have(tmp_path: P
 
 def test_the_page_of_the_flow_run_embeds_the_charts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
-    monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(run_page, "FlowRunContext", Mock())
     monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
     study(tmp_path, only=["pose_noise"])
     chart = (tmp_path / "store" / "stability" / "ada-mine-part-matrix.png").read_bytes()

@@ -1,5 +1,7 @@
 """What ablations, benchmarks and stability studies have in common before their first training."""
 
+import errno
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,8 +11,27 @@ import pytest
 
 from flows import ablations, benchmark, stability
 from hnerf.errors import InputError
+from tasks.stage import RETRIES
 
+Study = Callable[..., object]
 STUDIES = [(ablations, ablations.ablate), (benchmark, benchmark.benchmark), (stability, stability.stability)]
+
+
+@pytest.mark.parametrize(("module", "study"), STUDIES)
+def test_an_error_of_input_or_output_while_the_recording_is_read_is_retried(
+    module: ModuleType, study: Study, prefect_api: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[Path] = []
+
+    def read_capture(folder: Path, store: Path) -> None:
+        tried.append(folder)
+        raise InputError("ada: is read") if len(tried) == 2 else OSError(errno.ESTALE, "Stale file handle")
+
+    monkeypatch.setitem(RETRIES, "retry_delay_seconds", 0)
+    monkeypatch.setattr(module, "read_capture", read_capture)
+    with pytest.raises(InputError, match="ada: is read"):
+        study(tmp_path, store=tmp_path / "store")
+    assert tried == [tmp_path, tmp_path]
 
 
 @pytest.mark.parametrize(("module", "study"), STUDIES)
