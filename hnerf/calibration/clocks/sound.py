@@ -10,7 +10,7 @@ from scipy.fft import irfft, rfft
 from scipy.signal import resample
 
 from hnerf.capture.safe_io import check_camera_name, file_named
-from hnerf.errors import InputError
+from hnerf.errors import InputError, raise_if_unreachable
 
 RATE_HZ = 16_000  # to which sound is resampled: it travels 2 cm per sample
 BAND_HZ = (200.0, 7_000.0)  # below is hum and wind
@@ -72,7 +72,8 @@ def _read_wave(path: Path) -> np.ndarray:
         with wave.open(str(path)) as file:
             channels, width, rate_hz = file.getnchannels(), file.getsampwidth(), file.getframerate()
             samples = file.readframes(min(file.getnframes(), int(MAX_SECONDS * rate_hz)))
-    except (EOFError, OSError, RuntimeError, wave.Error):  # RuntimeError: a part longer than the file
+    except (EOFError, OSError, RuntimeError, wave.Error) as error:  # RuntimeError: a part longer than the file
+        raise_if_unreachable(error)
         raise InputError(f"{path}: not a readable .wav; export it again as 16-bit PCM") from None
     if width != 2 or rate_hz < 2 * BAND_HZ[0]:
         raise InputError(f"{path}: {8 * width} bits at {rate_hz} Hz; export it again as 16-bit PCM at 16 kHz or more")

@@ -1,8 +1,11 @@
 """Camera clocks estimated from keypoints and from sound, compared with known clocks."""
 
+import errno
+import os
 import tracemalloc
 import wave
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -277,4 +280,12 @@ def test_a_malformed_or_linked_wave_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.wav").rename(tmp_path / "b.wav")
     (tmp_path / "a.wav").symlink_to("b.wav")
     with pytest.raises(InputError, match=r"a\.wav: is a symbolic link"):
+        read_sound(tmp_path / "a.mp4")
+
+
+def test_a_wave_file_that_cannot_be_reached_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stale share says nothing about the file, which a later try may read."""
+    write_sound(tmp_path, bytes(20))
+    monkeypatch.setattr(wave, "open", Mock(side_effect=OSError(errno.ESTALE, os.strerror(errno.ESTALE))))
+    with pytest.raises(OSError, match="Stale file handle"):
         read_sound(tmp_path / "a.mp4")
