@@ -1,6 +1,7 @@
 """The stages before training, which `train-subject` and the studies have in common."""
 
 from collections.abc import Iterable
+from shutil import which
 from typing import NamedTuple
 
 from hnerf.capture.capture import Capture
@@ -41,7 +42,7 @@ def missing_cameras(store: Store, source: Source) -> Artifact | None:
         return None
     if (source.root / GROUND_TRUTH).exists():
         raise InputError(f"{source.root / GROUND_TRUTH}: of no use without a calibration; add that, or remove this")
-    return find_cameras(store, source)
+    return find_cameras(store, source, ("ffmpeg",) if which("ffmpeg") else ())
 
 
 def ingest_recording(store: Store, source: Source, settings: Settings) -> Artifact:

@@ -9,8 +9,9 @@ from tasks.stage import stage
 
 
 @stage("cameras", version="2")
-def find_cameras(out: Path, source: Source) -> dict[str, float]:
-    """Find the clocks and cameras of a recording from the person it shows."""
+def find_cameras(out: Path, source: Source, programs: tuple[str, ...]) -> dict[str, float]:
+    """Find the clocks and cameras of a recording from the person it shows. programs: those installed that read the
+    sound of videos, on which the result depends."""
     from hnerf.calibration.find_cameras import find_missing_cameras  # importing this takes a second
 
     read_source(source, find_missing_cameras, source.root, out)

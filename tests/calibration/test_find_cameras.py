@@ -9,7 +9,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from flows.preparation import ingest_recording
+from flows import preparation
+from flows.preparation import ingest_recording, missing_cameras
 from hnerf.calibration import find_cameras as module
 from hnerf.calibration.bundle import align
 from hnerf.calibration.clocks.estimate import Clocks
@@ -73,6 +74,22 @@ def test_a_recording_without_calibration_is_ingested_with_cameras_from_the_perso
     assert caged.call_count == 2  # cameras, capture
     made = {path.name for path in (tmp_path / "store" / "cameras").glob("*/*")}
     assert made == {"intri.yml", "extri.yml", "report.json"}
+
+
+def test_cameras_are_found_again_once_the_sound_of_videos_can_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever ffmpeg is installed."""
+
+    def find(source: Any, read: Any, root: Path, out: Path) -> None:
+        (out / "report.json").write_text('{"cameras": {"a": {"median_px": 1.0}}}')
+
+    monkeypatch.setattr("tasks.cameras.read_source", find)
+    (source, _), store, found = read_capture(film(tmp_path / "film", 3, 4)), Store(tmp_path / "store"), []
+    for program in (None, "/usr/bin/ffmpeg", "/opt/bin/ffmpeg"):
+        monkeypatch.setattr(preparation, "which", lambda _, program=program: program)
+        found.append(missing_cameras(store, source))
+    assert found[0] != found[1] == found[2]
 
 
 def test_clocks_of_videos_are_found_and_used(

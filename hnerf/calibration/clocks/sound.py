@@ -1,5 +1,6 @@
 """Start offsets from sound: what two microphones heard, correlated."""
 
+import logging
 import shutil
 import subprocess
 import wave
@@ -10,7 +11,7 @@ from scipy.fft import irfft, rfft
 from scipy.signal import resample
 
 from hnerf.capture.safe_io import check_camera_name, file_named
-from hnerf.errors import InputError, raise_if_unreachable
+from hnerf.errors import InputError, printable, raise_if_unreachable
 
 RATE_HZ = 16_000  # to which sound is resampled: it travels 2 cm per sample
 BAND_HZ = (200.0, 7_000.0)  # below is hum and wind
@@ -18,6 +19,9 @@ MIN_PEAK = 8.0  # minimum height of the peak, in standard deviations of the corr
 RIVAL_S = 0.05  # other peaks within this are echoes of the same offset
 MIN_OVER_RIVAL = 1.3  # times the next peak
 MAX_SECONDS = 7_200.0
+WITHOUT_SOUND = b"does not contain any stream"  # what ffmpeg says of the output then
+
+log = logging.getLogger("hnerf.calibration")
 
 
 def sound_offset(a: np.ndarray, b: np.ndarray) -> float | None:
@@ -62,7 +66,12 @@ def read_sound(path: Path) -> np.ndarray | None:
     command = [program, "-v", "error", "-nostdin", "-i", str(path.absolute()), "-vn", "-ac", "1", "-ar", str(RATE_HZ),
                "-t", str(MAX_SECONDS), "-f", "s16le", "-"]  # fmt: skip
     done = subprocess.run(command, capture_output=True, check=False)
-    return np.frombuffer(done.stdout, "<i2").astype(np.float32) if done.returncode == 0 and done.stdout else None
+    if done.returncode == 0:
+        return np.frombuffer(done.stdout, "<i2").astype(np.float32) if done.stdout else None
+    if WITHOUT_SOUND not in done.stderr:
+        *_, why = [f"exit code {done.returncode}", *done.stderr.decode(errors="replace").splitlines()]
+        log.warning("%s: its sound is not used (ffmpeg: %s)", path, printable(why))
+    return None
 
 
 def _read_wave(path: Path) -> np.ndarray:

@@ -289,3 +289,22 @@ def test_a_wave_file_that_cannot_be_reached_is_not_refused(tmp_path: Path, monke
     monkeypatch.setattr(wave, "open", Mock(side_effect=OSError(errno.ESTALE, os.strerror(errno.ESTALE))))
     with pytest.raises(OSError, match="Stale file handle"):
         read_sound(tmp_path / "a.mp4")
+
+
+@pytest.mark.parametrize(
+    ("says", "warned"),
+    [
+        ("Output file #0 does not contain any stream", []),
+        ("moov atom not found\na.mp4: Invalid data", ["a.mp4: its sound is not used (ffmpeg: a.mp4: Invalid data)"]),
+    ],
+)
+def test_sound_that_ffmpeg_cannot_read_is_noted(
+    says: str, warned: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A video without sound is usual."""
+    (tmp_path / "ffmpeg").write_text(f"#!/bin/sh\necho '{says}' >&2\nexit 1\n")
+    (tmp_path / "ffmpeg").chmod(0o755)
+    (tmp_path / "a.mp4").touch()
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert read_sound(tmp_path / "a.mp4") is None
+    assert [record.getMessage().removeprefix(f"{tmp_path}/") for record in caplog.records] == warned
