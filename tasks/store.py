@@ -106,8 +106,9 @@ class Store:
     root: Path
 
     def exists(self) -> bool:
-        """Return whether anything was ever stored here. A folder without any of these subfolders is not a store."""
-        return any((self.root / name).is_dir() for name in ("subjects", "ingested", "capture"))
+        """Return whether anything was ever stored here. A folder without any of these subfolders is not a store; one
+        with cameras/ may be where `hnerf calibrate` was run."""
+        return any((self.root / name).is_dir() for name in ("subjects", "ingested", "capture", "fetched", ".running"))
 
     def find(self, stage: str, key: str) -> Artifact | None:
         """Return the artifact if it is recorded and intact, else None. From now on, it counts as used by this

@@ -6,7 +6,7 @@ import pytest
 from flows.cli import main
 from flows.store_commands import duration_s
 from tasks.store import Store
-from tests.tasks.stores import run_of
+from tests.tasks.stores import add, run_of
 
 
 @pytest.fixture
@@ -71,6 +71,15 @@ def test_a_folder_that_is_not_a_store_is_refused(
     assert main(["store", *command.split(), "--store", "pictures"]) == 2
     assert capsys.readouterr().err == "hnerf: pictures: not a store; give its folder with --store\n"
     assert thumbnail.is_dir() and not (tmp_path / "ada.tar").exists()
+
+
+@pytest.mark.parametrize("stage", ["fetched", "cameras"])
+def test_what_a_run_left_that_ended_before_ingestion_is_listed(
+    stage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add(Store(tmp_path), stage, 10)
+    assert main(["store", "list", "--store", str(tmp_path)]) == 0
+    assert "all: 6 B; not needed: 0 B" in capsys.readouterr().out  # this process uses it
 
 
 def test_durations() -> None:
