@@ -57,7 +57,7 @@ class Bucket:
     @staticmethod
     def at(url: str) -> "Bucket":
         """Return the bucket of a URL like s3://bucket/folder or file:///mnt/share. Raises InputError if it does not
-        exist or no installed library can open it."""
+        exist or no installed library can open it, and BucketError if it cannot be reached."""
         try:
             if urlsplit(url).password or "::" in url:
                 raise InputError("a URL with a password or `::` is refused; give keys by the environment")
@@ -71,6 +71,10 @@ class Bucket:
             raise InputError(f"what opens {url} is not installed; for S3, install '.[s3]'") from None
         except (TypeError, ValueError) as error:  # TypeError: a file system that needs more than a URL
             raise InputError(f"{url}: {one_line(error)}; give a URL like s3://bucket/folder") from None
+        except InputError:
+            raise
+        except Exception as error:  # of a file system that connects at once
+            raise BucketError(f"{url}: {one_line(error)}; can the bucket be reached?") from error
         bucket = Bucket(fs, root.rstrip("/"))
         # A path that begins with a bucket's name is in an object store, where folders need not exist.
         top = bucket.root if bucket.root.startswith("/") else bucket.root.split("/")[0]

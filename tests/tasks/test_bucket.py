@@ -1,4 +1,5 @@
 import errno
+import socket
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
@@ -102,6 +103,14 @@ def test_an_empty_place_in_a_bucket_has_no_folders_and_files(s3: str) -> None:
 def test_a_missing_bucket_is_refused_and_not_created(s3: str) -> None:
     with pytest.raises(PlaceError, match="s3://none/x: none is not there; make it"):
         Bucket.at("s3://none/x")
+
+
+def test_a_server_that_refuses_the_connection_is_a_bucket_error() -> None:
+    """Some file systems, such as that of FTP, connect as soon as they are made."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(BucketError, match=rf"^ftp://127\.0\.0\.1:{port}/x: .*refused; can the bucket be reached\?$"):
+        Bucket.at(f"ftp://127.0.0.1:{port}/x")
 
 
 def test_a_vanished_network_share_is_a_bucket_error(tmp_path: Path) -> None:
