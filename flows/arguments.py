@@ -9,6 +9,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+from tasks.source import path_or_url
+
 MAX_COUNT = 999_999  # image names have six digits
 # The server refuses an empty one, as from a variable that is not set, which would be the checkout.
 StoreFolder = Annotated[Path, Field(json_schema_extra={"minLength": 1})]
@@ -23,6 +25,12 @@ def path(text: str) -> Path:
     if (shown := os.fsencode(whole).decode(errors="replace")) != whole:
         raise argparse.ArgumentTypeError(f"{shown} is not UTF-8; rename it")
     return Path(text)
+
+
+def path_or_bucket_url(text: str) -> Path | str:
+    """Return the URL of something in a bucket, or a path as `path` does."""
+    given = path_or_url(text)
+    return path(str(given)) if isinstance(given, Path) else given
 
 
 def number(kind: type[float], low: float, high: float) -> Callable[[str], float]:

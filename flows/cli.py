@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from flows import commands
-from flows.arguments import MAX_COUNT, number, path
+from flows.arguments import MAX_COUNT, number, path, path_or_bucket_url
 from flows.display import display
 from flows.ending import Terminated, drop_what_is_left, open_closed_streams, unwound_by_signals
 from flows.store_commands import add_store_commands
@@ -19,7 +19,6 @@ from hnerf.config import load_settings
 from hnerf.errors import DISK_FULL, REASON, UNREACHABLE, InputError, InvalidAsset
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
-from tasks.source import path_or_url
 from tasks.store import NAME, Store
 
 FAILED, BAD_INPUT, INTERRUPTED, ENDED = 1, 2, 130, 128  # as in shells: 128 plus the signal's number
@@ -192,7 +191,7 @@ def _parser() -> argparse.ArgumentParser:
         return added
 
     run = add(commands.run, store, preset)
-    run.add_argument("capture", type=path_or_url, help="capture folder, its URL in a bucket, or one video")
+    run.add_argument("capture", type=path_or_bucket_url, help="capture folder, its URL in a bucket, or one video")
     _add_overrides(run, "override a setting; `hnerf settings` lists all")
     add(commands.check_cameras, capture, preset)
     add(commands.settings, preset)

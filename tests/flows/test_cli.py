@@ -169,6 +169,10 @@ def test_a_path_that_is_not_utf8_is_refused(
     with pytest.raises(SystemExit, match="2"):
         main(["store", "list"])
     assert "caf\ufffd/store is not UTF-8; rename it" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):  # not later, when the name has been logged
+        main(["run", str(folder)])
+    assert capsys.readouterr().err.endswith("caf\ufffd is not UTF-8; rename it\n")
 
 
 def test_commands_that_read_a_recording_accept_its_memory_limit(
