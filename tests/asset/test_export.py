@@ -122,7 +122,7 @@ def test_export_writes_every_file_and_reports_their_contents(tmp_path: Path, mon
 def test_usd_has_both_meshes_with_topology_both(tmp_path: Path) -> None:
     for topology, splats in (("registered", 0), ("both", 300)):
         (tmp_path / topology).mkdir()
-        settings = overridden(SMALL, [f"topology={topology}", f"splats={splats}"])
+        settings = overridden(TINY, [f"topology={topology}", f"splats={splats}"])
         export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), settings, tmp_path / topology)
     one, two = (json.loads((tmp_path / name / "report.json").read_text()) for name in ("registered", "both"))
     assert two["mesh"] == one["mesh"] and "captured" not in one

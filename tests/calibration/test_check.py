@@ -224,8 +224,7 @@ def test_each_wrong_convention_is_named(tmp_path: Path, cause: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("count", [3, 4])
-@pytest.mark.parametrize("ratio", [0.25, 0.64, 1.5, 2])
+@pytest.mark.parametrize(("count", "ratio"), [(3, 0.25), (4, 0.64), (3, 1.5), (4, 2)])
 def test_intrinsics_for_another_image_size_are_named(tmp_path: Path, count: int, ratio: float) -> None:
     """The image size is blamed, not the unit, although the person would be 0.4 to 8.5 m tall."""
     wrong = recorded_with(tmp_path, lambda c: dataclasses.replace(c, K=np.diag([ratio, ratio, 1]) @ c.K), count=count)

@@ -263,5 +263,5 @@ def test_ingested_board_corners_are_in_pixels_of_the_shrunk_images(tmp_path: Pat
     capture = ingest(folder, CaptureSettings(max_side_px=160), tmp_path / "out")
     stored = load_board_corners(capture.root)
     assert stored is not None and (stored.cameras, stored.frame_step) == (rec.CAMERAS, 1)
-    assert stored.corners_px.shape == (2, 1, 12, 2)
+    assert stored.frames == (3,) and stored.corners_px.shape == (2, 1, 12, 2)
     assert stored.corners_px[0, 0, 0].tolist() == pytest.approx([99.5 / 2 - 0.25, 59.5 / 2 - 0.25], abs=0.13)

@@ -49,9 +49,10 @@ def test_a_line_has_key_value_type_bounds_and_comment() -> None:
     assert "shape.levels=[4, 8] list of int" in [" ".join(line.split()) for line in settings_list(Scene())]
 
 
-@pytest.mark.parametrize("preset", sorted(path.stem for path in config.CONFIGS.glob("*.yaml")))
-def test_every_setting_says_what_it_means(preset: str) -> None:
-    lines = [*settings_list(load_settings(preset)), *settings_list(SyntheticSettings())]
+@pytest.mark.parametrize("preset", ["fast", "paper", "nerf", "idr", "neural-body", "nerfies", None])
+def test_every_setting_says_what_it_means(preset: str | None) -> None:
+    """Each kind of field has its own settings."""
+    lines = settings_list(SyntheticSettings() if preset is None else load_settings(preset))
     assert [line for line in lines if len(re.split(" {2,}", line)) < 3] == []
 
 

@@ -61,12 +61,11 @@ def test_a_surface_between_training_samples_is_not_a_collapse(tmp_path: Path):
     trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
 
 
-@pytest.mark.parametrize("kind", ["fast", "paper"])
 @pytest.mark.parametrize(
-    ("outwards", "message"),
+    ("kind", "outwards", "message"),
     [
-        (-FAR, r"surface is empty \(covers 0% of the person\): check masks and body fit"),
-        (FAR, r"surface fills the box \(covers 100% of the surroundings\): check the masks"),
+        ("fast", -FAR, r"surface is empty \(covers 0% of the person\): check masks and body fit"),
+        ("paper", FAR, r"surface fills the box \(covers 100% of the surroundings\): check the masks"),
     ],
 )
 def test_a_collapsed_surface_is_an_error(tmp_path: Path, kind: str, outwards: float, message: str):
