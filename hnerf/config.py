@@ -83,8 +83,6 @@ class SegmentationSettings(Section):
     """Settings of the masks."""
 
     excluded_from_key: ClassVar[tuple[str, ...]] = ("rounds", "still_px")  # the flow uses them: it repeats the stage
-    shadow_chroma: float = Field(default=0.01, gt=0)  # std of log colour ratios in a shadow, beyond noise
-    darkest_shadow: float = Field(default=0.3, gt=0, lt=1)  # brightness left in the deepest shadow, as a share
     reach: float = Field(default=0.13, gt=0)  # of clothes and hair beyond the limbs, in body heights
     model: Path | None = None  # ONNX segmentation network; comes before clean plates, after given masks
     rounds: int = Field(default=3, ge=1)  # most rounds of fit and segmentation, if there are neither masks nor plates
@@ -104,8 +102,6 @@ class FitSettings(Section):
     offset_m: float = Field(default=0.02, gt=0)  # std of the detector's place of a keypoint about the body model's
     stature_m: float = Field(default=1.72, gt=0)  # mean height of people
     stature_std_m: float = Field(default=0.08, gt=0)  # std of the height of people
-    phenotype_std: float = Field(default=0.25, gt=0)  # std of anny's phenotype values
-    local_change_std: float = Field(default=0.3, gt=0)  # std of anny's local shape changes
     acceleration_mps2: float = Field(default=10.0, gt=0)  # std of the trunk; limbs have two to four times as much
     inside_m: float = Field(default=0.008, gt=0)  # std of residuals where the mask's edge lies inside the body
     outside_m: float = Field(default=0.02, gt=0)  # std of residuals where the mask's edge lies outside the body

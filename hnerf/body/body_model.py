@@ -13,6 +13,7 @@ from hnerf.body.smpl import BETAS, T_POSE_BONES, read_smpl, rest_rotations
 from hnerf.config import FitSettings
 
 SHAPED = ("vertices_m", "joints_m", "beta", "shape_basis", "joint_basis")  # what in a rig depends on its shape
+PHENOTYPE_STD, LOCAL_CHANGE_STD = 0.25, 0.3  # of anny's shape values
 SMPL_BETA_LIMIT = 5.0  # standard deviations
 
 
@@ -38,17 +39,17 @@ class BodyModel:
 
 def body_model(settings: FitSettings) -> BodyModel:
     """Return the model that the settings name. Raises InputError if its file is missing or holds no known model."""
-    return _anny(settings) if settings.body_model == "anny" else _smpl(settings)
+    return _anny() if settings.body_model == "anny" else _smpl(settings)
 
 
-def _anny(settings: FitSettings) -> BodyModel:
+def _anny() -> BodyModel:
     average = anny_rig().to(dtype=torch.float64)
 
     def rig(beta: Tensor | None) -> Rig:
         shaped = anny_rig(beta)
         return replace(average, **{name: getattr(shaped, name).double() for name in SHAPED})
 
-    std = [settings.phenotype_std] * len(PHENOTYPES) + [settings.local_change_std] * len(LOCAL_CHANGES)
+    std = [PHENOTYPE_STD] * len(PHENOTYPES) + [LOCAL_CHANGE_STD] * len(LOCAL_CHANGES)
     mean, stds, low, high = (torch.tensor(v, dtype=torch.float64) for v in (ADULT, std, BETA_LOW, BETA_HIGH))
     details = torch.arange(len(ADULT)) >= len(PHENOTYPES)
     rest = rig(None)

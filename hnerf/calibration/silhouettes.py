@@ -278,7 +278,6 @@ def _masks(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[i
     given = [capture.given_mask(name, capture.frames[i]) for i in shown]
     if all(mask is not None for mask in given):
         return [mask for mask in given if mask is not None]
-    settings = SegmentationSettings()
-    prior_of = keypoint_priors(capture, name, keypoints, settings)
-    mask_of = background_subtraction(capture, name, prior_of, PLATE_FRAMES, settings)
+    prior_of = keypoint_priors(capture, name, keypoints, SegmentationSettings())
+    mask_of = background_subtraction(capture, name, prior_of, PLATE_FRAMES)
     return [mask_of(capture.frames[i], prior_of(i)) for i in shown]

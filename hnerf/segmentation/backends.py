@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hnerf.capture.capture import Capture
-from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.segmentation.cut import components_within, cut
@@ -30,10 +29,7 @@ class Backend(NamedTuple):
     by_prior: bool = False
 
 
-def choose_backend(
-    capture: Capture, camera: str, prior_of: PriorOf, fitted: bool, network: Network | None,
-    settings: SegmentationSettings,
-) -> Backend:  # fmt: skip
+def choose_backend(capture: Capture, camera: str, prior_of: PriorOf, fitted: bool, network: Network | None) -> Backend:
     """Return the first possible source of masks: given masks, the user's network, a clean plate, then the background
     around a `fitted` body or a detected person.
 
@@ -51,7 +47,7 @@ def choose_backend(
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
-    return Backend(name, background_subtraction(capture, camera, prior_of, MEDIAN_FRAMES, settings), by_prior)
+    return Backend(name, background_subtraction(capture, camera, prior_of, MEDIAN_FRAMES), by_prior)
 
 
 def given_mask(capture: Capture, camera: str, frame: int, prior: Prior) -> np.ndarray:
@@ -71,24 +67,21 @@ def _learned_mask(capture: Capture, camera: str, network: Network, frame: int, p
     return components_within(likely & prior.reach, prior.reach)
 
 
-def background_subtraction(
-    capture: Capture, camera: str, prior_of: PriorOf, count: int, settings: SegmentationSettings
-) -> MaskOf:
+def background_subtraction(capture: Capture, camera: str, prior_of: PriorOf, count: int) -> MaskOf:
     """Return masks from the difference to the clean plate, which is known everywhere, if there is one, else to the
     median over at most `count` frames of the pixels that their priors leave free."""
     plate = capture.background(camera)
     if plate is not None:
-        return partial(_subtracted, capture, camera, plate, np.ones(plate.shape[:2], bool), False, settings)
+        return partial(_subtracted, capture, camera, plate, np.ones(plate.shape[:2], bool), False)
     chosen = evenly_spaced(range(len(capture.frames)), count)
     images = [capture.image(camera, capture.frames[i]) for i in chosen]
     plate, known = masked_median(images, [prior_of(i).near for i in chosen])
-    return partial(_subtracted, capture, camera, plate, known, True, settings)
+    return partial(_subtracted, capture, camera, plate, known, True)
 
 
 def _subtracted(
-    capture: Capture, camera: str, plate: np.ndarray, known: np.ndarray, is_median: bool,
-    settings: SegmentationSettings, frame: int, prior: Prior,
-) -> np.ndarray:  # fmt: skip
+    capture: Capture, camera: str, plate: np.ndarray, known: np.ndarray, is_median: bool, frame: int, prior: Prior
+) -> np.ndarray:
     """Return the mask found by GrabCut in the window within reach of the prior. plate (H, W, 3) uint8 RGB, where it is
     `known`, (H, W) bool."""
     image, window = capture.image(camera, frame), bounding_window(prior.reach)
@@ -97,6 +90,6 @@ def _subtracted(
         return mask
     free = visible_background(prior, known)
     plate = exposure_corrected(plate, image, free)
-    found = difference(image[window], plate[window], noise_level(image, plate, free), settings, shadowed=is_median)
+    found = difference(image[window], plate[window], noise_level(image, plate, free), shadowed=is_median)
     mask[window] = cut(image[window], found, prior.cropped(window), known[window])
     return mask

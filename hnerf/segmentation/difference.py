@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hnerf.config import SegmentationSettings
 from hnerf.segmentation.prior import Prior
 
 LOG_OFFSET = 6.0  # grey levels added before the logarithm: below them sensors and JPEG carry little information
 RATIO_NOISE = 0.01  # of log ratios, in addition to the pixel's own noise: JPEG, rounding of the plate
+SHADOW_CHROMA = 0.01  # std of log colour ratios in a shadow, beyond noise
+DARKEST_SHADOW = 0.3  # share of the brightness that is left in the deepest shadow
 SHADOW_TINT = 0.02  # log chroma per log brightness: gamma and stray light tint deep shadows a little
 SHADOW_SHARE = 0.1  # prior share of the background near a person
 MAX_GREY_SPREAD = 6  # grey levels between the channels of a grey image: videos round its chroma, by 3 levels
@@ -74,9 +75,7 @@ def _some(image: np.ndarray, where: np.ndarray) -> np.ndarray:
     return image.reshape(-1, 3)[np.flatnonzero(where)[::PIXEL_STRIDE]]
 
 
-def difference(
-    image: np.ndarray, plate: np.ndarray, noise: float, settings: SegmentationSettings, shadowed: bool = False
-) -> Difference:
+def difference(image: np.ndarray, plate: np.ndarray, noise: float, shadowed: bool = False) -> Difference:
     """Compare images (H, W, 3) uint8 RGB. `shadowed`: the plate, a median over time, may contain shadows itself.
 
     The logarithm of their ratio splits into brightness and chroma. Unchanged background has neither; a shadow lowers
@@ -89,8 +88,8 @@ def difference(
     chroma = ((ratio - brightness[..., None]) ** 2).sum(-1)
     noise_variance = (NOISE_FACTOR * noise / unlit.min(-1)) ** 2 + RATIO_NOISE**2
     unchanged = _log_gaussian(3 * brightness**2, noise_variance, 1) + _log_gaussian(chroma, noise_variance, 2)
-    tint = noise_variance + settings.shadow_chroma**2 + (SHADOW_TINT * np.minimum(brightness, 0)) ** 2
-    darkest = float(np.log(settings.darkest_shadow))
+    tint = noise_variance + SHADOW_CHROMA**2 + (SHADOW_TINT * np.minimum(brightness, 0)) ** 2
+    darkest = float(np.log(DARKEST_SHADOW))
     shadow = _log_uniform(brightness, darkest, -darkest if shadowed else 0.0) + _log_gaussian(chroma, tint, 2)
     grey = (image.max(-1) - image.min(-1)).max() <= MAX_GREY_SPREAD
     share, tones = (GREY_SHADOW_SHARE, tint) if grey else (SHADOW_SHARE, PERSON_CHROMA**2)

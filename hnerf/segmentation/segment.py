@@ -38,7 +38,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     cameras: dict[str, Any] = {}
     absent = _frames_without_subject(capture)
     for name, prior_of in tracked(priors, "segmentation", len(capture.train_cameras)):
-        backend = choose_backend(capture, name, prior_of, body is not None, network, settings)
+        backend = choose_backend(capture, name, prior_of, body is not None, network)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
         judged = partial(_judged_mask, capture, backend, prior_of, absent)
         masks = list(side_by_side(judged, range(len(capture.frames))))

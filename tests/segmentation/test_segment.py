@@ -36,7 +36,7 @@ def test_a_shadow_is_not_the_person_by_hand() -> None:
     image = plate.copy()
     image[10:30, 10:30] = (90, 72, 54)
     image[10:30, 50:70] = (54, 72, 90)
-    found = difference(image, plate, noise_level(image, plate, np.ones((40, 80), bool)), SETTINGS)
+    found = difference(image, plate, noise_level(image, plate, np.ones((40, 80), bool)))
     assert (found.log_odds[12:28, 12:28] < -1).all()
     assert (found.log_odds[12:28, 52:68] > 4).all()
     assert (found.log_odds[:8] < -4).all()
@@ -51,7 +51,7 @@ def test_in_grey_images_a_dark_region_may_be_a_person_or_a_shadow(tint: tuple[in
     image = plate.copy()
     image[10:30, 10:30], image[10:30, 50:70] = 90, 20
     image, plate = ((pixels + np.array(tint)).astype(np.uint8) for pixels in (image, plate))
-    found = difference(image, plate, noise_level(image, plate, np.ones((40, 80), bool)), SETTINGS)
+    found = difference(image, plate, noise_level(image, plate, np.ones((40, 80), bool)))
     assert (np.abs(found.log_odds[12:28, 12:28]) < 1).all()
     assert (found.log_odds[12:28, 52:68] > 4).all()
     assert (found.log_odds[:8] < -4).all()
@@ -89,8 +89,8 @@ def test_only_a_median_plate_may_itself_contain_shadows() -> None:
     # The image is 1 / 0.6 as bright as the plate, in all channels.
     plate = np.full((8, 8, 3), (90, 72, 54), np.uint8)
     image = np.full((8, 8, 3), (150, 120, 90), np.uint8)
-    assert (difference(image, plate, 1.0, SETTINGS).log_odds > 4).all()
-    assert (difference(image, plate, 1.0, SETTINGS, shadowed=True).log_odds < 0).all()
+    assert (difference(image, plate, 1.0).log_odds > 4).all()
+    assert (difference(image, plate, 1.0, shadowed=True).log_odds < 0).all()
 
 
 def test_masked_median_by_hand() -> None:
