@@ -193,6 +193,7 @@ FAULTS = (
     Fault("fast-core", "fields/fast", "slots[ends][core[count > 0]]", "slots[:0]"),
     Fault("fast-other-ray", "fields/fast", "near[1:] & ~ends[:-1] & ((y", "near[1:] & ((y"),
     Fault("fast-back-to-other-ray", "fields/fast", " & ~ends[:-2]).to(d_hat)", ").to(d_hat)"),
+    Fault("bvh-ends", "asset/bvh_file", "skin.weights.argmax(1)", "skin.weights.argmin(1)"),
     Fault("fast-probe", "fields/fast", "count.cumsum(0) - count +", "count.cumsum(0) - 1 + 0 *",
           "fields/fast_ray"),
     Fault("samples-by-path", "fields/shell", "(self.cell_m * cumulative[:, -1] / spacing_m).ceil()",

@@ -164,7 +164,7 @@ def _motion(folder: Path) -> None:
 
 def _bvh(folder: Path) -> None:
     offsets, turns = np.eye(3)[:2], np.tile(np.eye(3), (2, 2, 1, 1))
-    write_bvh(folder / "a.bvh", Bvh(("arm", "fore"), np.array([-1, 0]), offsets, 0.04, turns[..., 0], turns))
+    write_bvh(folder / "a.bvh", Bvh(("arm", "fore"), np.array([-1, 0]), offsets, 0.04, turns[..., 0], turns), offsets)
 
 
 def _camera_path(folder: Path) -> None:

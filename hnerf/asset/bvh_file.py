@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from hnerf.asset.rigs import GAME
+from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
 from hnerf.body.bvh import Bvh, write_bvh
 from hnerf.body.skeletons import OWN, name_in
 
 CENTIMETRES = 100  # per metre; MotionBuilder and Maya read BVH files in centimetres
 RATE = RATES[-1]
+FRONT_SHARE = 0.1  # of how far a point is in front of its joint, added to its distance
 
 
 def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
@@ -31,4 +33,16 @@ def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
     own = avatar.joint_names == OWN
     named_as = "mixamo" if own else avatar.joint_names
     names = tuple(name_in(named_as, name, prefixed=not own) for name in skeleton.names[1:])
-    write_bvh(path, Bvh(names, parents, offsets, 1 / RATE, positions, local))
+    ends = CENTIMETRES * tips_m(skeleton.positions_m, rig.skin, avatar.rest_points_m)[1:]
+    write_bvh(path, Bvh(names, parents, offsets, 1 / RATE, positions, local), ends)
+
+
+def tips_m(joints_m: np.ndarray, skin: Skin, points_m: np.ndarray) -> np.ndarray:
+    """Return the tips of joints (J, 3), relative to them: of the points (V, 3) that follow a joint most, the farthest;
+    of an eyeball's points, which are equally far, one at the front. Joints that no point follows most have none, (0, 0,
+    0)."""
+    follows, tips = skin.joints[np.arange(len(points_m)), skin.weights.argmax(1)], np.zeros_like(joints_m)
+    for joint in np.unique(follows):
+        off_m = points_m[follows == joint] - joints_m[joint]
+        tips[joint] = off_m[(np.linalg.norm(off_m, axis=1) + FRONT_SHARE * off_m[:, 2]).argmax()]
+    return tips

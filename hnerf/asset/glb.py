@@ -72,11 +72,13 @@ class GlbWriter:
         self.document.save_binary(path)
 
 
-def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
+def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig, licence: str = "") -> None:
     """Write a rig of the avatar with all its motions except the resampled ones. Joints are nodes 0 to J-1, the mesh is
-    node J; time 0 is a motion's first instant. Mesh and skin are named as in USD; Blender shows these names."""
+    node J; time 0 is a motion's first instant. Mesh and skin are named as in USD; Blender shows these names. licence:
+    of the asset, if the user gave one; glTF calls it the copyright."""
     writer = GlbWriter()
     document = writer.document
+    document.asset.copyright = licence or None
     _add_joints(document, rig.skeleton, avatar.joint_names)
     names = [*avatar.blend_shapes_m, *avatar.physiques_m]
     primitive = _primitive(writer, avatar, rig.skin)

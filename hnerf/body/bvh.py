@@ -84,10 +84,10 @@ def read_bvh(path: Path) -> Bvh:
     return _poses(joints, values, frame_s)
 
 
-def write_bvh(path: Path, motion: Bvh) -> None:
-    """Write a motion. Only the root's positions are written; other joints keep their offsets. End sites repeat their
-    joint's offset."""
-    lines = ["HIERARCHY", *_hierarchy_lines(motion, 0, ""), "MOTION", f"Frames: {len(motion.positions)}"]
+def write_bvh(path: Path, motion: Bvh, ends: np.ndarray) -> None:
+    """Write a motion. Only the root's positions are written; other joints keep their offsets. ends (J, 3): end sites of
+    the joints that have none below them, relative to these."""
+    lines = ["HIERARCHY", *_hierarchy_lines(motion, ends, 0, ""), "MOTION", f"Frames: {len(motion.positions)}"]
     lines.append(f"Frame Time: {motion.frame_s:.9g}")
     turns = [
         Rotation.from_matrix(motion.rotations[:, joint]).as_euler(_written_order(joint), degrees=True)
@@ -204,7 +204,7 @@ def _depth_first(parents: np.ndarray) -> list[int]:
     return order
 
 
-def _hierarchy_lines(motion: Bvh, joint: int, indent: str) -> list[str]:
+def _hierarchy_lines(motion: Bvh, ends: np.ndarray, joint: int, indent: str) -> list[str]:
     """Return the lines of a joint and of all joints below it."""
 
     def offset(values: np.ndarray) -> str:
@@ -217,7 +217,7 @@ def _hierarchy_lines(motion: Bvh, joint: int, indent: str) -> list[str]:
     lines.append(f"{inside}CHANNELS {channels}")
     below = np.nonzero(motion.parents == joint)[0].tolist()
     for child in below:
-        lines += _hierarchy_lines(motion, child, inside)
+        lines += _hierarchy_lines(motion, ends, child, inside)
     if not below:
-        lines += [f"{inside}End Site", f"{inside}{{", f"{inside}\t{offset(motion.offsets[joint])}", f"{inside}}}"]
+        lines += [f"{inside}End Site", f"{inside}{{", f"{inside}\t{offset(ends[joint])}", f"{inside}}}"]
     return [*lines, f"{indent}}}"]

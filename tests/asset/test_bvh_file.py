@@ -1,11 +1,13 @@
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hnerf.asset.bvh_file import write_avatar_bvh
+from hnerf.asset.bvh_file import tips_m, write_avatar_bvh
+from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.bvh import read_bvh
 from hnerf.body.skeletons import JointNames
@@ -53,3 +55,27 @@ def test_bvh_holds_the_captured_motion_in_centimetres(axes: np.ndarray, staged: 
         np.testing.assert_allclose(file.rotations[row, 1], [[1, 0, 0], [0, c, -s], [0, s, c]], atol=1e-6)
         heading = [np.sin(0.8 * frame), 0, np.cos(0.8 * frame)]  # where the axis that faces +Z at rest points
         np.testing.assert_allclose(turns[row, 0] @ [0, 0, 1], heading, atol=1e-6)
+
+
+def test_the_tip_of_a_joint_is_its_farthest_point() -> None:
+    """A toe's points lie 3 and 7 cm in front of its joint; another point, farther off, follows it only in part. Of an
+    eyeball's points, all 1 cm away, the front one is its tip. No point follows the third joint most."""
+    joints_m = np.array([[0.1, 0.02, 0.0], [0.0, 1.6, 0.1], [0.0, 1.0, 0.0]])
+    toe = [[0.1, 0.02, 0.03], [0.11, 0.01, 0.07], [0.1, 0.02, -0.2]]
+    eye = [[0.01, 1.6, 0.1], [0.0, 1.61, 0.1], [0.0, 1.6, 0.11], [0.0, 1.6, 0.09]]
+    joints = np.array([[0, 2], [0, 2], [1, 0], *([[1, 0]] * 4)])
+    weights = np.array([[0.6, 0.4], [0.6, 0.4], [0.7, 0.3], *([[1.0, 0.0]] * 4)])
+    found = tips_m(joints_m, Skin(joints, weights), np.array(toe + eye))
+    np.testing.assert_allclose(found[0], [0.01, -0.01, 0.07], atol=1e-12)
+    np.testing.assert_allclose(found[2], 0)
+    eyeball = tips_m(joints_m, Skin(joints[3:], weights[3:]), np.array(eye))
+    np.testing.assert_allclose(eyeball[1], [0, 0, 0.01], atol=1e-12)
+
+
+def test_end_sites_are_the_tips_of_the_end_joints(staged: StagedAvatar, tmp_path: Path) -> None:
+    """The column's upper joint, at a height of 0.8 m, ends at the rim of its top, with clothes 1.65 m high and 18 cm
+    in radius."""
+    write_avatar_bvh(tmp_path / "avatar.bvh", staged)
+    (end,) = re.findall(r"End Site\n\s*{\n\s*OFFSET (.*)", (tmp_path / "avatar.bvh").read_text())
+    x, height, z = map(float, end.split())
+    assert (height, np.hypot(x, z)) == (pytest.approx(85, abs=0.5), pytest.approx(18, abs=0.5)) and z > 0

@@ -43,6 +43,12 @@ def glb(rig: str, staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory
     return path
 
 
+def test_a_licence_is_the_copyright(staged: StagedAvatar, tmp_path: Path) -> None:
+    for licence in ("CC-BY-4.0", ""):
+        write_glb(tmp_path / "avatar.glb", staged, staged.rigs["game"], licence)
+        assert pygltflib.GLTF2().load(tmp_path / "avatar.glb").asset.copyright == (licence or None)
+
+
 def accessor(document: pygltflib.GLTF2, index: int) -> np.ndarray:
     """Return the values of an accessor."""
     item = document.accessors[index]

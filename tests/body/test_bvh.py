@@ -1,3 +1,4 @@
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -53,7 +54,9 @@ def test_writing_and_reading_preserves_the_motion(tmp_path: Path) -> None:
     file = read_bvh(written(tmp_path, ELBOW))
     fork = Bvh(("a", "b", "c", "d"), np.array([-1, 0, 0, 1]), np.eye(4)[:, :3], 0.1,
                np.tile(np.eye(4)[:, :3], (2, 1, 1)), file.rotations[:, [0, 1, 1, 0]])  # fmt: skip
-    write_bvh(tmp_path / "b.bvh", fork)
+    write_bvh(tmp_path / "b.bvh", fork, np.diag([7.0, 8, 9, 6])[:, :3])
+    ends = re.findall(r"End Site\n\s*{\n\s*OFFSET (.*)", (tmp_path / "b.bvh").read_text())
+    assert ends == ["0.000000 0.000000 0.000000", "0.000000 0.000000 9.000000"]  # of d and c
     again = read_bvh(tmp_path / "b.bvh")
     assert again.names == ("a", "b", "d", "c")  # depth first
     order = [0, 1, 3, 2]
@@ -68,7 +71,7 @@ def test_written_angles_do_not_jump_at_180_or_90_degrees(tmp_path: Path) -> None
     knee = Rotation.from_euler("XYZ", [[80, 4, 5], [100, 4, 5]], degrees=True).as_matrix()
     offsets = np.array([[0.0, 9, 0], [0, -1, 0]])
     leg = Bvh(("hip", "knee"), np.array([-1, 0]), offsets, 0.1, np.tile(offsets, (2, 1, 1)), np.stack([root, knee], 1))
-    write_bvh(tmp_path / "b.bvh", leg)
+    write_bvh(tmp_path / "b.bvh", leg, offsets)
     rows = np.loadtxt((tmp_path / "b.bvh").read_text().splitlines()[-2:])
     np.testing.assert_allclose(rows, [[0, 9, 0, 170, 2, 3, 80, 4, 5], [0, 9, 0, 190, 2, 3, 100, 4, 5]], atol=1e-5)
     np.testing.assert_allclose(read_bvh(tmp_path / "b.bvh").rotations, leg.rotations, atol=1e-6)

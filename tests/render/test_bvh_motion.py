@@ -157,7 +157,7 @@ def test_a_missing_motion_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_suffix_decides_how_a_motion_is_read(tmp_path: Path) -> None:
-    write_bvh(tmp_path / "walk.BVH", t_pose(5))
+    write_bvh(tmp_path / "walk.BVH", t_pose(5), np.zeros((len(T_POSE), 3)))
     motion = read_motion(tmp_path / "walk.BVH", "1:4")
     assert (motion.body.frames, motion.fps, motion.up) == ((1, 2, 3), 30.0, "y")
     assert isinstance(motion.body.theta, torch.Tensor) and len(motion.body.theta) == 3
