@@ -279,6 +279,8 @@ FAULTS = (
     Fault("own-network-no-feet", "detection/keypoint_network", "np.where(lacks, others[camera], points)", "points"),
     Fault("own-network-upright", "detection/keypoint_network", "angle = person.next.angle", "angle = 0.0"),
     Fault("own-network-bgr", "detection/keypoint_network", "(crop - MEAN) / STD", "(crop[..., ::-1] - MEAN) / STD"),
+    Fault("crowd-masks-shifted", "detection/detect", "mask_rows.append(len(masks))",
+          "mask_rows.append(len(everybody))"),
     Fault("own-network-unheard", "detection/detect", "        people = network.body_25(", "        network.body_25(",
           "detection/keypoint_network"),
     Fault("ground-anywhere", "capture/standing", "return low <= measured_m <= high", "return True", "body/ground"),

@@ -80,7 +80,9 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
         check_subject(capture, ranked[0])
     subjects = dict(zip(detected.train_cameras, ranked[0].keypoints, strict=True))
     for name in capture.train_cameras:
-        keep_subject(out, capture, name, subjects[name], people[name], _load(out, name, "masks", "regions"))
+        keep_subject(
+            out, capture, name, subjects[name], people[name], _load(out, name, "masks", "mask_rows", "regions")
+        )
     draw_people(out / PICTURE, detected, ranked)
     report = {"cameras": {name: _summary(people) for name, people in found.items()}, "people": people_rows(ranked)}
     write_result(out / REPORT, DetectionReport, report)
@@ -135,8 +137,9 @@ def _find_people(capture: Capture, settings: DetectionSettings, out: Path) -> di
 def find_in_camera(capture: Capture, camera: str, settings: DetectionSettings, out: Path) -> float:
     """Write one camera's masks, and then, atomically, `landmarks/<camera>.npz`; return the milliseconds per image.
 
-    The file holds `points_px` (frames, people, 33, 3): x, y, confidence; `points_m` (frames, people, 33, 3); `masks`
-    (frames, people, 256, 256) uint8 in `regions` (frames, people, 4): centre x and y, side, angle. With a keypoint
+    The file holds `points_px` (frames, people, 33, 3): x, y, confidence; `points_m` (frames, people, 33, 3); `regions`
+    (frames, people, 4): centre x and y, side, angle; `masks` (M, 256, 256) uint8 in these regions, only of images with
+    several people, from row `mask_rows` (frames,) on: twenty thousand images would fill the memory. With a keypoint
     network of the user's own also `own_px` (frames, people, K, 3), its points.
     """
     cv2.setNumThreads(1)
@@ -145,12 +148,14 @@ def find_in_camera(capture: Capture, camera: str, settings: DetectionSettings, o
     frames = tracked(capture.frames, "detection", len(capture.frames))
     images, again = tee(capture.image(camera, frame) for frame in frames)
     found = track(images, PersonDetector(), LandmarkNetwork(settings.size))
-    everybody, own = [], []
+    everybody, masks, mask_rows, own = [], list[np.ndarray](), [], []
     for frame, image, people in zip(capture.frames, again, found, strict=True):
         if network is not None:
             own.append(np.array([network(image, person) for person in people]).reshape(-1, network.points, 3))
         write_image(out / PERSON / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))
-        everybody.append([person._replace(mask=to_8_bit(person.mask)) for person in people])
+        mask_rows.append(len(masks))
+        masks += [to_8_bit(person.mask) for person in people] if len(people) > 1 else []
+        everybody.append([person._replace(mask=np.zeros(0)) for person in people])
     path = out / LANDMARKS / f"{camera}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".partial")
@@ -159,7 +164,8 @@ def find_in_camera(capture: Capture, camera: str, settings: DetectionSettings, o
             file,
             points_px=_by_frame(everybody, lambda person: person.points_px, (POINTS, 3)),
             points_m=_by_frame(everybody, lambda person: person.points_m, (POINTS, 3)),
-            masks=_by_frame(everybody, lambda person: person.mask, (SIZE, SIZE), np.uint8),
+            masks=np.array(masks, np.uint8).reshape(-1, SIZE, SIZE),
+            mask_rows=np.array(mask_rows),
             regions=_by_frame(everybody, lambda person: np.array([*person.region.centre_px, *person.region[1:]]), (4,)),
             **({} if network is None else {"own_px": pad_people(own)}),  # type: ignore[arg-type]
         )
@@ -169,13 +175,10 @@ def find_in_camera(capture: Capture, camera: str, settings: DetectionSettings, o
 
 
 def _by_frame(
-    everybody: list[list[Person]],
-    value: Callable[[Person], np.ndarray],
-    shape: tuple[int, ...],
-    dtype: type = np.float64,
+    everybody: list[list[Person]], value: Callable[[Person], np.ndarray], shape: tuple[int, ...]
 ) -> np.ndarray:
     """Return a value of each person in each frame as one array (frames, people, *shape), 0 for absent people."""
-    return pad_people([np.array([value(p) for p in people], dtype).reshape(-1, *shape) for people in everybody])
+    return pad_people([np.array([value(p) for p in people], float).reshape(-1, *shape) for people in everybody])
 
 
 def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarray:

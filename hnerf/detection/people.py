@@ -44,8 +44,9 @@ def keep_subject(
 ) -> None:
     """Rewrite the masks of those images of a camera that show other people, or that do not show the subject.
 
-    subject (frames, 25, 3); people (frames, P, 25, 3): everybody whom the network found, in the order of `masks` and
-    `regions` in `found`. A pixel more likely to show another person is not the subject's.
+    subject (frames, 25, 3); people (frames, P, 25, 3): everybody whom the network found, in the order of their
+    `regions` in `found` and, in images of several people, their `masks`, as `find_in_camera` stores them. A pixel more
+    likely to show another person is not the subject's.
     """
     size_px = capture.cameras[camera].size_px
     for i, frame in enumerate(capture.frames):
@@ -65,7 +66,7 @@ def _pasted(found: dict[str, np.ndarray], row: int, person: int, size_px: tuple[
     """Return a person's mask in the image, (H, W) float32 up to 255."""
     x, y, side_px, angle = found["regions"][row, person]
     region = Region(np.array([x, y]), side_px, angle)
-    return region.paste(found["masks"][row, person].astype(np.float32), size_px)
+    return region.paste(found["masks"][found["mask_rows"][row] + person].astype(np.float32), size_px)
 
 
 def people_rows(people: list[PersonTrack]) -> list[dict[str, Any]]:

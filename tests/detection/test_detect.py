@@ -20,7 +20,9 @@ from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, DetectionSettings
 from hnerf.detection import detect as module
-from hnerf.detection.detect import detect, with_keypoints
+from hnerf.detection.detect import detect, find_in_camera, with_keypoints
+from hnerf.detection.landmarks import Person
+from hnerf.detection.region import Region
 from hnerf.errors import InputError
 from hnerf.models import SHA256, has_model
 from tests.calibration.synthetic import edited_keypoints
@@ -184,3 +186,21 @@ def test_workers_do_not_keep_the_processor_time_that_a_reader_had_when_they_bega
     finally:
         resource.setrlimit(resource.RLIMIT_CPU, before)
     assert found == dict.fromkeys(("01", "02"), (hard_s, hard_s))
+
+
+def test_masks_are_stored_only_of_images_with_several_people(
+    recording: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The five images of camera 01 show 1, 2, 0, 3 and 1 people; the nth person's mask has the value n of 255."""
+    counts, number = [1, 2, 0, 3, 1], iter(range(1, 8))
+    region = Region(np.array([5.0, 4.0]), 8.0, 0.0)
+
+    def person() -> Person:
+        return Person(np.ones((33, 3)), np.zeros((33, 3)), np.full((256, 256), next(number) / 255), region, region)
+
+    monkeypatch.setattr(module, "track", lambda images, *_: [[person() for _ in range(count)] for count in counts])
+    find_in_camera(recording, "01", NETWORK, tmp_path)
+    with np.load(tmp_path / "landmarks" / "01.npz") as found:
+        assert found["points_px"].shape == (5, 3, 33, 3)
+        assert found["mask_rows"].tolist() == [0, 0, 2, 2, 5]
+        assert found["masks"].dtype == np.uint8 and found["masks"].max((1, 2)).tolist() == [2, 3, 4, 5, 6]

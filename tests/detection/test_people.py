@@ -38,13 +38,17 @@ def capture(tmp_path: Path) -> Capture:
 
 def test_a_pixel_belongs_to_the_person_with_the_higher_mask_value(capture: Capture, tmp_path: Path) -> None:
     """Both masks cover the image. The other person's has 200 of 255 on its right half, the subject's has 150
-    everywhere. In the second image the other person is alone."""
-    masks = np.zeros((2, 2, 256, 256), np.uint8)
-    masks[:, 0, :, 128:], masks[:, 1] = 200, 150
+    everywhere. In the second image the other person is alone, so no mask is stored. Masks of an earlier image come
+    first."""
+    masks = np.full((4, 256, 256), 255, np.uint8)
+    masks[2] = 0
+    masks[2, :, 128:], masks[3] = 200, 150
     regions = np.tile([49.5, 49.5, 100.0, 0.0], (2, 2, 1))
     people = np.stack([[standing(75), standing(25)], [standing(75), 0 * standing(25)]])
     subject = np.stack([standing(25), 0 * standing(25)])
-    keep_subject(tmp_path, capture, "c0", subject, people, {"masks": masks, "regions": regions})
+    keep_subject(
+        tmp_path, capture, "c0", subject, people, {"masks": masks, "mask_rows": np.array([2, 4]), "regions": regions}
+    )
     first, second = (
         cv2.imread(str(tmp_path / "person" / "c0" / f"00000{k}.png"), cv2.IMREAD_GRAYSCALE) for k in (0, 1)
     )
@@ -54,7 +58,7 @@ def test_a_pixel_belongs_to_the_person_with_the_higher_mask_value(capture: Captu
 
 
 def test_the_mask_is_unchanged_if_the_subject_is_alone(capture: Capture, tmp_path: Path) -> None:
-    people, found = np.stack([[standing(25)]] * 2), {"masks": np.zeros((2, 1, 256, 256)), "regions": np.ones((2, 1, 4))}
+    people, found = np.stack([[standing(25)]] * 2), {"regions": np.ones((2, 1, 4))}
     keep_subject(tmp_path, capture, "c0", people[:, 0], people, found)
     assert not (tmp_path / "person").exists()
 
