@@ -177,8 +177,9 @@ class FastField(Field):
             depths, count, core, row, background = (
                 torch.cat([t] * many) for t in (depths, count, core, row, background)
             )
-        ends = torch.zeros_like(row, dtype=torch.bool)
-        ends[count.cumsum(0)[count > 0] - 1] = True
+        met = torch.nonzero(count)[:, 0]  # the rays that have samples
+        last = count.cumsum(0)[met] - 1
+        ends = torch.zeros_like(row, dtype=torch.bool).index_fill(0, last, True)
         rows = torch.cat([row, row[more]])
         described, moved = self._deformed(skin, scene.conditions.frame_row[rows])
         near = described.near & (described.d <= self.outer_m[described.vertex])  # cells reach farther than the shell
@@ -196,18 +197,19 @@ class FastField(Field):
         alpha_dot = alpha_from_sdf(
             on_rays(least_around(described, d_hat, ends), self.reach_m), self.log_sharpness.exp()
         )
-        opaque = slots[ends][core[count > 0]]  # an opaque core: nothing shines through if the surface lies deeper
-        alpha = alpha_dot.flatten().index_fill(0, opaque, 1.0).view_as(alpha_dot)
+        # an opaque core: nothing shines through if the surface lies deeper
+        end = torch.where(core[met], 1.0, alpha_dot.flatten()[slots[last]])
+        alpha = alpha_dot.flatten().index_copy(0, slots[last], end).view_as(alpha_dot)
         on_surface, weights = move_to_surface(described, d_hat, ends), weights_from_alpha(alpha.detach())
         colour = self._ray_colours(scene, on_surface, weights, slots, row)
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            probed = (count.cumsum(0) - count + (draws.probe * count).long())[count > 0]
+            probed = last - count[met] + 1 + (draws.probe[met] * count[met]).long()
             norms = self._gradient_norms(described.pick(probed), skin.pick(chosen[probed]), pose, row[probed])
         elastic = None
         if moved is not None:
             energy = torch.where(described.near, (moved.index_select(0, chosen) / ELASTIC_M).square().sum(-1), 0.0)
-            elastic = (on_rays(energy, 0.0).sum(1) / count)[count > 0]
+            elastic = on_rays(energy, 0.0).sum(1)[met] / count[met]
         in_box = on_rays(described.near, False).any(1, keepdim=True).expand_as(alpha).float()
         d, residual = on_rays(d, self.reach_m), on_rays(residual, 0.0)
         return RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic), depths
