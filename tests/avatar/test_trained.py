@@ -62,7 +62,7 @@ def test_both_networks_of_the_paper_use_the_bf16_setting(tmp_path: Path, bf16: b
 
 
 def test_ray_batches_are_limited_by_their_number_of_samples(subject: Path, monkeypatch: pytest.MonkeyPatch):
-    """Rays have eight samples, and a batch may have 2048 samples."""
+    """Rays have at most 64 samples, and a batch may have 16384 samples."""
     capture, _, body = record(subject / "capture")
     avatar, at_once = load_avatar(subject, "cpu"), []
     look = avatar.field.render_rays
@@ -72,7 +72,7 @@ def test_ray_batches_are_limited_by_their_number_of_samples(subject: Path, monke
         return look(scene, rays)
 
     monkeypatch.setattr(avatar.field, "render_rays", counted)
-    monkeypatch.setattr(model, "SAMPLES_PER_BATCH", 2048)
+    monkeypatch.setattr(model, "SAMPLES_PER_BATCH", 16384)
     avatar.render(capture.cameras["0"], body.theta[0], body.root[0])
     assert len(at_once) > 1 and at_once[0] == max(at_once) == 256
 
