@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +86,9 @@ class StorePolicy(CachePolicy):
         place = hashlib.sha256(str(store.root).encode()).hexdigest()[:8]
         record = f"{task.name}-{key}-{place}"
         results = task_ctx.result_store
-        if results.exists(record) and results.read(record).result != store.find(task.name, key):
-            (PREFECT_RESULTS_LOCAL_STORAGE_PATH.value() / record).unlink(missing_ok=True)  # another run may have
+        with suppress(ValueError):  # Prefect's, if another run has dropped the record meanwhile
+            if results.exists(record) and results.read(record).result != store.find(task.name, key):
+                (PREFECT_RESULTS_LOCAL_STORAGE_PATH.value() / record).unlink(missing_ok=True)
         return record
 
 

@@ -24,7 +24,7 @@ def find_missing_cameras(folder: Path, out: Path) -> None:
     """
     manifest = read_manifest(folder)
     check_world_of_person(folder, manifest)
-    chosen_cameras(folder, manifest, cameras_without_calibration(folder), [])
+    chosen_cameras(folder, manifest, cameras_without_calibration(folder), [], "the folder")
     log.warning("%s: no calibration (extri.yml or another): finding cameras from the person takes minutes", folder)
     clocks = read_clocks(folder)
     if not clocks and not image_folders_in(folder):

@@ -133,13 +133,15 @@ def capture_name(folder: Path, manifest: CaptureManifest) -> str:
     return name
 
 
-def chosen_cameras(folder: Path, manifest: CaptureManifest, calibrated: list[str], published: list[str]) -> CameraSplit:
+def chosen_cameras(
+    folder: Path, manifest: CaptureManifest, known: list[str], published: list[str], where: str = "the calibration"
+) -> CameraSplit:
     """Return the cameras that `capture.toml` names, else the published ones for training and the rest for testing, else
-    all for training. Raises InputError on one that is unknown or named twice."""
+    all for training. where: what lists the known ones. Raises InputError on one that is unknown or named twice."""
     if manifest.cameras is None:
-        train = published or calibrated
-        return CameraSplit(train=train, test=[name for name in calibrated if name not in train])
-    _check(folder, "camera", manifest.cameras.train + manifest.cameras.test, calibrated, "the calibration")
+        train = published or known
+        return CameraSplit(train=train, test=[name for name in known if name not in train])
+    _check(folder, "camera", manifest.cameras.train + manifest.cameras.test, known, where)
     return manifest.cameras
 
 

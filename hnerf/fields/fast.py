@@ -33,7 +33,7 @@ SPACING_M = 0.012  # between rendered samples; twice as many gain 0.05 dB on val
 SPACING_PX, MIN_SPACING_M = 4, 0.003  # in close-ups, where fingers would have fringes, and ears speckles
 SAMPLE_COUNTS = (6, 12, 18, 24, 36, 64, 128)  # a ray gets the smallest sufficient number, or the last
 MOST_SAMPLES = 64  # on a ray in training
-HALF_SAMPLES_UNTIL = 0.75  # of the training: as accurate on three captures, in three quarters of the time
+WIDE_SPACING_UNTIL = 0.75  # of the training: half the samples there were as accurate, in three quarters of the time
 MAX_NEIGHBOUR_DISTANCE_M = 0.03  # canonical; neighbours on a ray that are farther apart lie on different limbs
 MIN_DESCENT_M = 1e-4  # of d_hat from one sample to the next; below it the surface position has no useful derivative
 MIN_COLOUR_WEIGHT = 1e-3  # samples of less weight are not coloured
@@ -222,8 +222,8 @@ class FastField(Field):
     def training_samples(self, progress: float) -> tuple[int, float | None]:
         """Return twice the spacing early in each phase, while the surface or novel poses are still far from their final
         state."""
-        few = 1 if progress >= HALF_SAMPLES_UNTIL else 2
-        return MOST_SAMPLES // few, self.settings.spacing_m * few
+        wider = 1 if progress >= WIDE_SPACING_UNTIL else 2
+        return MOST_SAMPLES // wider, self.settings.spacing_m * wider
 
     def samples_needed(self, scene: PosedScene[ShellGrid], rays: Rays) -> Tensor:
         """Return as many samples as the length of a ray's path through the shell requires."""

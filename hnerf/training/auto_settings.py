@@ -129,7 +129,7 @@ def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[s
         "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, plus a margin"),
         "spacing_m": Decision(
             min(SPACING_CELLS * cell_m, MAX_SPACING_M),
-            f"{SPACING_CELLS:g} cells, at most {_mm(MAX_SPACING_M)}",
+            f"{SPACING_CELLS:g} cells of {_mm(cell_m)}, at most {_mm(MAX_SPACING_M)}",
         ),
         "colour_cells": Decision(colour_cells, finest),
         "geometry_cells": Decision(

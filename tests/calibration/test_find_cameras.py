@@ -175,7 +175,7 @@ def test_a_point_in_a_video_needs_clocks(tmp_path: Path, calibrated_with: list[A
     [
         ('up = "y"', "up: without a calibration, Z is up; remove the line"),
         ('units = "mm"', "units: cameras found from the person are in metres; remove the line"),
-        ('[cameras]\ntrain = ["a", "b", "c"]', r"camera c is not in the calibration; correct \[cameras\]"),
+        ('[cameras]\ntrain = ["a", "b", "c"]', r"camera c is not in the folder; correct \[cameras\]"),
     ],
 )
 def test_what_ingestion_would_refuse_is_refused_before_cameras_are_found(

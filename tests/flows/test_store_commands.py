@@ -73,11 +73,17 @@ def test_a_folder_that_is_not_a_store_is_refused(
     assert thumbnail.is_dir() and not (tmp_path / "ada.tar").exists()
 
 
-@pytest.mark.parametrize("stage", ["fetched", "cameras"])
+def test_a_copy_that_was_fetched_makes_a_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A run that was killed while it fetched a capture from a bucket leaves nothing else."""
+    (tmp_path / "fetched" / f"{'a' * 32}.partial").mkdir(parents=True)
+    assert main(["store", "list", "--store", str(tmp_path)]) == 0
+    assert "all: 0 B" in capsys.readouterr().out
+
+
 def test_what_a_run_left_that_ended_before_ingestion_is_listed(
-    stage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    add(Store(tmp_path), stage, 10)
+    add(Store(tmp_path), "cameras", 10)
     assert main(["store", "list", "--store", str(tmp_path)]) == 0
     assert "all: 6 B; not needed: 0 B" in capsys.readouterr().out  # this process uses it
 

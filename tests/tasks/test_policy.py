@@ -36,13 +36,16 @@ def key(task: str = "fit", version: str = "1", **changed: Any) -> str:
     return stage_key(task, version, inputs | {"several": (artifact(), artifact("b"))} | changed)
 
 
-def test_a_stale_record_may_be_dropped_by_another_run_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Here it is gone when this run removes it."""
+@pytest.mark.parametrize("read", [Mock(), Mock(side_effect=ValueError("Path ... does not exist."))])
+def test_a_stale_record_may_be_dropped_by_another_run_first(
+    read: Mock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Here it is gone when this run removes it, or already when it reads it."""
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setattr("tasks.policy.PREFECT_RESULTS_LOCAL_STORAGE_PATH", Mock(value=lambda: tmp_path))
     context, store = Mock(), Mock(root=tmp_path)
     context.task.name, context.task.version = "fit", "1"
-    context.result_store.exists.return_value = True
+    context.result_store.exists.return_value, context.result_store.read = True, read
     record = StorePolicy().compute_key(context, {"store": store, "inputs": {"source": source()}}, {})
     assert record is not None and record.startswith("fit-")
 

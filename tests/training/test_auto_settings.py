@@ -42,7 +42,7 @@ def test_settings_equal_values_computed_by_hand():
     assert fast.geometry_cells == (16, 32, 64)
     assert (fast.outer_m, fast.inner_m, fast.spacing_m) == (0.05, 0.03, 0.006)
     assert (fast.pose_width, settings.steps) == (8, 2400)
-    assert decisions["field.spacing_m"].reason == "0.6 cells, at most 6.0 mm"
+    assert decisions["field.spacing_m"].reason == "0.6 cells of 20.0 mm, at most 6.0 mm"
 
 
 @pytest.mark.parametrize(

@@ -195,9 +195,11 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
 
 def _given_lenses(folder: Path) -> dict[str, Lens]:
     """Return the lenses of the calibration file in a folder, which need not contain poses; none if there is no such
-    file. Those that were estimated from the person are left out."""
-    paths = (path_in_capture(folder, name) for name in INTRINSICS)
-    whole = any(path.name != FROM_PERSON for pattern in WHOLE_CALIBRATIONS for path in folder.glob(pattern))
+    file. Those that were estimated from the person are left out: intri.yml marks them, files beside FROM_PERSON may
+    hold them unmarked."""
+    marked = (folder / "calibration" / FROM_PERSON).exists()
+    paths = (path_in_capture(folder, name) for name in (INTRINSICS[:1] if marked else INTRINSICS))
+    whole = not marked and any(any(folder.glob(name)) for name in WHOLE_CALIBRATIONS)
     if file := next((path for path in paths if path.exists()), None):
         lenses = read_lenses(file)
     else:

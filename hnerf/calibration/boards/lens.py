@@ -38,7 +38,7 @@ class LensEstimate:
     def certainty(self) -> str:
         """Return how well the lens is known, in words."""
         if self.lens is None:
-            return f"{self.pictures} different pictures of the board where {MIN_PICTURES} are needed"
+            return f"pictures between which the board moved: {self.pictures} where {MIN_PICTURES} are needed"
         known = f"focal length known to {100 * self.focal_std:.1f} %"
         return f"{self.pictures} pictures of the board, {self.tilted} of them tilted, {known}"
 

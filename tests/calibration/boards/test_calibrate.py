@@ -226,7 +226,7 @@ def test_pictures_of_a_board_held_still_count_as_one() -> None:
         for corners_px in (held, often)
     )
     assert still.pictures == 1 and still.reliable_lens is None and moved.pictures == 20
-    assert still.certainty == "1 different pictures of the board where 10 are needed"
+    assert still.certainty == "pictures between which the board moved: 1 where 10 are needed"
 
 
 def test_a_board_has_moved_if_most_of_the_corners_that_two_pictures_share_have() -> None:
@@ -267,7 +267,9 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
         write_cameras(tmp_path, [Lens("a", K, distortion, np.eye(3), np.zeros(3), size_px)], "easymocap")
         calibration = calibrate_from_boards(tmp_path)
         assert calibration.lenses["a"].K[0, 0] == 901 and calibration.lenses["a"].size_px == (1280, 720)
-        assert calibration.intrinsics["a"].startswith("given; not verified by the footage (9 different pictures")
+        assert calibration.intrinsics["a"].startswith(
+            "given; not verified by the footage (pictures between which the board moved: 9"
+        )
     write_cameras(tmp_path, [Lens("a", K, distortion, np.eye(3), np.zeros(3), (640, 360))], "easymocap")
     with pytest.raises(InputError, match="extrinsic/a: is 1280 x 720 px, but its intrinsics are for 640 x 360"):
         calibrate_from_boards(tmp_path)
@@ -293,12 +295,14 @@ def test_intrinsics_are_read_from_files_without_poses(tmp_path: Path, kind: str)
     assert lenses["cam_7"].K[0, 0] == 900 and words["cam_7"].startswith("given; not verified")
 
 
-@pytest.mark.parametrize("pose2sim", [False, True])
-def test_lenses_estimated_from_the_person_are_not_given_ones(tmp_path: Path, pose2sim: bool) -> None:
-    """They would beat those of the extrinsic footage. Pose2Sim's file has no mark."""
+@pytest.mark.parametrize(("pose2sim", "formats"), [(False, ()), (True, ()), (True, ("aniposelib", "colmap"))])
+def test_lenses_estimated_from_the_person_are_not_given_ones(
+    tmp_path: Path, pose2sim: bool, formats: tuple[str, ...]
+) -> None:
+    """They would beat those of the extrinsic footage. Pose2Sim's file has no mark, nor have others beside it."""
     K, here = np.diag([500.0, 500, 1]), (np.zeros(5), np.eye(3), np.zeros(3), (1280, 720))
     lenses = [Lens("a", K, *here, estimated=True), Lens("b", K, *here)]
-    write_calibration(tmp_path, lenses, "person", (), pose2sim)
+    write_calibration(tmp_path, lenses, "person", formats, pose2sim)
     footage = BoardFootage(tmp_path / "extrinsic", BOARD, (0,), 1, {"a": close_up(0.7)}, {"a": (1280, 720)})
     found, words = calibration_boards._intrinsics(tmp_path, footage)
     assert found["a"].K[0, 0] == pytest.approx(900, rel=0.005) and words["a"].startswith("from extrinsic/: 20 pictures")
