@@ -13,7 +13,8 @@ from hnerf.body.skeletons import OWN, name_in
 
 CENTIMETRES = 100  # per metre; MotionBuilder and Maya read BVH files in centimetres
 RATE = RATES[-1]
-FRONT_SHARE = 0.1  # of how far a point is in front of its joint, added to its distance
+FRONT = np.array([0.0, 0.0, 1.0])
+SURROUNDED = 0.2  # points whose mean is nearer to their joint than this share of the farthest one's distance
 
 
 def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
@@ -38,11 +39,14 @@ def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
 
 
 def tips_m(joints_m: np.ndarray, skin: Skin, points_m: np.ndarray) -> np.ndarray:
-    """Return the tips of joints (J, 3), relative to them: of the points (V, 3) that follow a joint most, the farthest;
-    of an eyeball's points, which are equally far, one at the front. Joints that no point follows most have none, (0, 0,
-    0)."""
+    """Return the tips of joints (J, 3), relative to them: towards the mean of the points (V, 3) that follow a joint
+    most, or to the front if they surround it, as an eyeball's do, and as far as these points reach. Joints that no
+    point follows most have none, (0, 0, 0)."""
     follows, tips = skin.joints[np.arange(len(points_m)), skin.weights.argmax(1)], np.zeros_like(joints_m)
     for joint in np.unique(follows):
         off_m = points_m[follows == joint] - joints_m[joint]
-        tips[joint] = off_m[(np.linalg.norm(off_m, axis=1) + FRONT_SHARE * off_m[:, 2]).argmax()]
+        mean_m, farthest_m = off_m.mean(0), np.linalg.norm(off_m, axis=1).max()
+        surrounded = np.linalg.norm(mean_m) < SURROUNDED * farthest_m
+        direction = FRONT if surrounded else mean_m / np.linalg.norm(mean_m)
+        tips[joint] = (off_m @ direction).max() * direction
     return tips
