@@ -193,7 +193,7 @@ FAULTS = (
     Fault("fast-core", "fields/fast", "torch.where(core[met], 1.0, ", "torch.where(~core[met] & core[met], 1.0, "),
     Fault("fast-other-ray", "fields/fast", "near[1:] & ~ends[:-1] & ((y", "near[1:] & ((y"),
     Fault("fast-back-to-other-ray", "fields/fast", " & ~ends[:-2]).to(d_hat)", ").to(d_hat)"),
-    Fault("bvh-ends", "asset/bvh_file", "skin.weights.argmax(1)", "skin.weights.argmin(1)"),
+    Fault("bvh-ends", "asset/bvh_file", "skin.joints[:, 0]", "skin.joints[:, -1]"),
     Fault("fast-probe", "fields/fast", "last - count[met] + 1 +", "last + 0 *",
           "fields/fast_ray"),
     Fault("samples-by-path", "fields/shell", "(self.cell_m * cumulative[:, -1] / spacing_m).ceil()",

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from hnerf.asset.rigs import GAME
+from hnerf.asset.skeleton import FRONT
 from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
 from hnerf.body.bvh import Bvh, write_bvh
@@ -13,7 +14,6 @@ from hnerf.body.skeletons import OWN, name_in
 
 CENTIMETRES = 100  # per metre; MotionBuilder and Maya read BVH files in centimetres
 RATE = RATES[-1]
-FRONT = np.array([0.0, 0.0, 1.0])
 SURROUNDED = 0.2  # points whose mean is nearer to their joint than this share of the farthest one's distance
 
 
@@ -42,7 +42,7 @@ def tips_m(joints_m: np.ndarray, skin: Skin, points_m: np.ndarray) -> np.ndarray
     """Return the tips of joints (J, 3), relative to them: towards the mean of the points (V, 3) that follow a joint
     most, or to the front if they surround it, as an eyeball's do, and as far as these points reach. Joints that no
     point follows most have none, (0, 0, 0)."""
-    follows, tips = skin.joints[np.arange(len(points_m)), skin.weights.argmax(1)], np.zeros_like(joints_m)
+    follows, tips = skin.joints[:, 0], np.zeros_like(joints_m)
     for joint in np.unique(follows):
         off_m = points_m[follows == joint] - joints_m[joint]
         mean_m, farthest_m = off_m.mean(0), np.linalg.norm(off_m, axis=1).max()

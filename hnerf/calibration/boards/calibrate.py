@@ -197,9 +197,9 @@ def _given_lenses(folder: Path) -> dict[str, Lens]:
     """Return the lenses of the calibration file in a folder, which need not contain poses; none if there is no such
     file. Those that were estimated from the person are left out: intri.yml marks them, files beside FROM_PERSON may
     hold them unmarked."""
-    marked = (folder / "calibration" / FROM_PERSON).exists()
-    paths = (path_in_capture(folder, name) for name in (INTRINSICS[:1] if marked else INTRINSICS))
-    whole = not marked and any(any(folder.glob(name)) for name in WHOLE_CALIBRATIONS)
+    from_person = (folder / "calibration" / FROM_PERSON).exists()
+    paths = (path_in_capture(folder, name) for name in (INTRINSICS[:1] if from_person else INTRINSICS))
+    whole = not from_person and any(any(folder.glob(name)) for name in WHOLE_CALIBRATIONS)
     if file := next((path for path in paths if path.exists()), None):
         lenses = read_lenses(file)
     else:
