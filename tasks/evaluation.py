@@ -19,7 +19,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("evaluation", version="21", networks=(LPIPS_ALEXNET,))
+@stage("evaluation", version="22", networks=(LPIPS_ALEXNET,))
 def evaluate(
     out: Path,
     truth: Source,
@@ -52,7 +52,7 @@ def evaluate(
     return _headline(found) | {f"holdout {name}": value for name, value in held_out_mean.items()}
 
 
-@stage("holdout", version="6", networks=(LPIPS_ALEXNET,))
+@stage("holdout", version="7", networks=(LPIPS_ALEXNET,))
 def evaluate_held_out(
     out: Path,
     recording: Artifact,

@@ -1,7 +1,6 @@
 """Interface of a field, used by trainer and renderer."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -88,31 +87,21 @@ class Field(nn.Module, ABC):
         """Record the progress of the field's training, from 0 to 1. Called once after each step but the last, however
         many parts a step has."""
 
-    def samples_needed(self, scene: PosedScene[Any], rays: Rays) -> Tensor:
-        """Return the number of samples that rendering takes along R rays: (R,) long, 0 where nothing is visible."""
-        return torch.full((len(rays),), self.samples, device=rays.frame.device)
+    def rendering_draws(self, scene: PosedScene[Any], rays: Rays) -> Draws:
+        """Return the draws with which R rays are rendered."""
+        return Draws.deterministic(len(rays), self.samples, rays.frame.device)
 
     def render_rays(self, scene: PosedScene[Any], rays: Rays) -> Tensor:
         """Render the person alone along R rays, with opacity b alpha (docs/method.md, "Evaluation protocol").
 
         Returns (R, 5): colour over black, coverage, and depth in metres, 0 where nothing is hit.
         """
-        rendered = rays.origins_m.new_zeros(len(rays), 5)
-        for pick, draws in self._by_samples(scene, rays):
-            rendered[pick] = composited(*self.sample(scene, rays.pick(pick), draws))
-        return rendered
+        return composited(*self.sample(scene, rays, self.rendering_draws(scene, rays)))
 
     def render_beside(self, scene: PosedScene[Any], rays: Rays, directions: Tensor) -> Tensor:
         """Render M neighbours of each of R rays as `render_rays` does: (M, R, 5). They have the same origins, and unit
         directions (M, R, 3) close to those of the rays."""
         return torch.stack([self.render_rays(scene, Rays(rays.origins_m, d, rays.frame)) for d in directions])
-
-    def _by_samples(self, scene: PosedScene[Any], rays: Rays) -> Iterator[tuple[Tensor, Draws]]:
-        """Yield the rays that see anything, (N,) long, grouped by their number of samples, with their draws."""
-        needed = self.samples_needed(scene, rays)
-        for count in needed[needed > 0].unique().tolist():
-            pick = torch.nonzero(needed == count)[:, 0]
-            yield pick, Draws.deterministic(len(pick), count, rays.frame.device)
 
     def coverage(self, samples: RaySamples) -> Tensor:
         """Return how far the learned content covers each ray, (R,)."""
@@ -136,5 +125,6 @@ def composited(samples: RaySamples, depths: Tensor) -> Tensor:
     """Return what R rays with samples at depths (R, K) see of the person alone, (R, 5), as `Field.render_rays` does."""
     weights = weights_from_alpha(samples.in_box * samples.alpha)
     cover = weights.sum(1, keepdim=True)
-    depth = (weights * depths).sum(1, keepdim=True) / cover.clamp(min=1e-6)
+    shown = depths if samples.surface_m is None else samples.surface_m
+    depth = (weights * shown).sum(1, keepdim=True) / cover.clamp(min=1e-6)
     return torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)

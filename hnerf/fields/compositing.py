@@ -24,7 +24,7 @@ def alpha_from_sdf(signed_distance: Float[Tensor, "R K"], sharpness: Float[Tenso
     """
     log_phi = torch.nn.functional.logsigmoid(sharpness * signed_distance)
     alpha = 1 - torch.exp((log_phi[:, 1:] - log_phi[:, :-1]).clamp(max=0))
-    return torch.cat([alpha, torch.zeros_like(alpha[:, :1])], 1)
+    return torch.cat([alpha, torch.zeros_like(signed_distance[:, :1])], 1)
 
 
 def weights_from_alpha(alpha: Float[Tensor, "R K"]) -> Float[Tensor, "R K"]:

@@ -64,17 +64,19 @@ class Draws:
         background = torch.rand(rays, 3, generator=generator, device=device)
         probe = torch.rand(rays, generator=generator, device=device)
         view = view_sigma * torch.randn(rays, 3, generator=generator, device=device)
-        return Draws(jitter, background, fine, probe, view, _spacing(rays, spacing_m, device))
+        return Draws(jitter, background, fine, probe, view, _by_ray(spacing_m, rays, device))
 
     @staticmethod
-    def deterministic(rays: int, samples: int, device: torch.device, spacing_m: float | None = None) -> "Draws":
+    def deterministic(
+        rays: int, samples: int, device: torch.device, spacing_m: Tensor | float | None = None
+    ) -> "Draws":
         """Return the numbers for rendering: every sample in the middle of its stratum, over black."""
         middle = torch.full((rays, samples), 0.5, device=device)
-        return Draws(middle, torch.zeros(rays, 3, device=device), middle, spacing_m=_spacing(rays, spacing_m, device))
+        return Draws(middle, torch.zeros(rays, 3, device=device), middle, spacing_m=_by_ray(spacing_m, rays, device))
 
 
-def _spacing(rays: int, spacing_m: float | None, device: torch.device) -> Tensor | None:
-    return None if spacing_m is None else torch.full((rays,), spacing_m, device=device)
+def _by_ray(spacing_m: Tensor | float | None, rays: int, device: torch.device) -> Tensor | None:
+    return None if spacing_m is None else torch.as_tensor(spacing_m, device=device).expand(rays)
 
 
 def shard(batch: Batch, rank: int, world_size: int) -> Batch:

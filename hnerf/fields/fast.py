@@ -18,7 +18,7 @@ from hnerf.fields.deformation import FrameDeformation
 from hnerf.fields.grids import CanonicalField
 from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
-from hnerf.fields.shell import ShellGrid, surface_points
+from hnerf.fields.shell import MIN_SAMPLES, ShellGrid, surface_points
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import within_reach
 
@@ -29,10 +29,9 @@ GRID_MARGIN_M = 0.01  # between the shell and the end of the grids
 SHELL_MARGIN_M = 0.012  # for later movement of the surface, and for poses that were not evaluated
 TIGHTEN_STEP_M = 0.004
 ELASTIC_M = 0.01  # displacement whose elastic energy is 1
-SPACING_M = 0.012  # between rendered samples; twice as many gain 0.05 dB on valid-wave for twice the time
+SPACING_M = 0.01  # between rendered samples; twice as many gain 0.05 dB on valid-wave for twice the time
 SPACING_PX, MIN_SPACING_M = 4, 0.003  # in close-ups, where fingers would have fringes, and ears speckles
-SAMPLE_COUNTS = (6, 12, 18, 24, 36, 64, 128)  # a ray gets the smallest sufficient number, or the last
-MOST_SAMPLES = 64  # on a ray in training
+MOST_SAMPLES, MOST_RENDERED = 64, 128  # on a ray, in training and in rendering
 WIDE_SPACING_UNTIL = 0.75  # of the training: half the samples there were as accurate, in three quarters of the time
 MAX_NEIGHBOUR_DISTANCE_M = 0.03  # canonical; neighbours on a ray that are farther apart lie on different limbs
 MIN_DESCENT_M = 1e-4  # of d_hat from one sample to the next; below it the surface position has no useful derivative
@@ -151,11 +150,8 @@ class FastField(Field):
     def render_beside(self, scene: PosedScene[ShellGrid], rays: Rays, directions: Tensor) -> Tensor:
         """Render M neighbours of each ray as Field.render_beside does. Their descriptors are derived, to first order,
         from the closest points of the ray between them: a quarter of a pixel away, these are the same."""
-        rendered = directions.new_zeros(*directions.shape[:2], 5)
-        for pick, draws in self._by_samples(scene, rays):
-            seen = composited(*self._sample(scene, rays.pick(pick), draws, directions[:, pick]))
-            rendered[:, pick] = seen.unflatten(0, (len(directions), -1))
-        return rendered
+        seen = composited(*self._sample(scene, rays, self.rendering_draws(scene, rays), directions))
+        return seen.unflatten(0, (len(directions), -1))
 
     def _sample(
         self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws, directions: Tensor | None
@@ -172,7 +168,7 @@ class FastField(Field):
         bodies, pose, points_m = scene.bodies, scene.conditions.pose, rays.pick(ray).points(depth_m)
         skin, more = bodies.describe_by_limbs(points_m, row, self.reach_m, scene.correction, beside_m=beside_m)
         if directions is not None:
-            many = len(directions)
+            many, depth_m = len(directions), depth_m.repeat(len(directions))
             slots = (slots + depths.numel() * torch.arange(many, device=slots.device)[:, None]).flatten()
             depths, count, core, row, background = (
                 torch.cat([t] * many) for t in (depths, count, core, row, background)
@@ -194,13 +190,13 @@ class FastField(Field):
             every = values.new_full((depths.numel(), *values.shape[1:]), elsewhere)
             return every.index_copy(0, slots, values).unflatten(0, depths.shape)
 
-        alpha_dot = alpha_from_sdf(
-            on_rays(least_around(described, d_hat, ends), self.reach_m), self.log_sharpness.exp()
-        )
+        least = least_around(described, d_hat, ends)
+        alpha_dot = alpha_from_sdf(on_rays(least, self.reach_m), self.log_sharpness.exp())
         # an opaque core: nothing shines through if the surface lies deeper
         end = torch.where(core[met], 1.0, alpha_dot.flatten()[slots[last]])
         alpha = alpha_dot.flatten().index_copy(0, slots[last], end).view_as(alpha_dot)
-        on_surface, weights = move_to_surface(described, d_hat, ends), weights_from_alpha(alpha.detach())
+        on_surface, surface_m = move_to_surface(described, d_hat, depth_m, ends)
+        weights = weights_from_alpha(alpha.detach())
         colour = self._ray_colours(scene, on_surface, weights, slots, row)
         norms = d.new_zeros(0)
         if draws.probe is not None:
@@ -211,8 +207,9 @@ class FastField(Field):
             energy = torch.where(described.near, (moved.index_select(0, chosen) / ELASTIC_M).square().sum(-1), 0.0)
             elastic = on_rays(energy, 0.0).sum(1)[met] / count[met]
         in_box = on_rays(described.near, False).any(1, keepdim=True).expand_as(alpha).float()
-        d, residual = on_rays(d, self.reach_m), on_rays(residual, 0.0)
-        return RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic), depths
+        d, residual, surface_m = on_rays(d, self.reach_m), on_rays(residual, 0.0), on_rays(surface_m.detach(), 0.0)
+        found = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic, surface_m)
+        return found, depths
 
     def coverage(self, samples: RaySamples) -> Tensor:
         """Return the coverage by the surface, not by the solid core that ends rays behind it; rays that start inside
@@ -225,16 +222,14 @@ class FastField(Field):
         wider = 1 if progress >= WIDE_SPACING_UNTIL else 2
         return MOST_SAMPLES // wider, self.settings.spacing_m * wider
 
-    def samples_needed(self, scene: PosedScene[ShellGrid], rays: Rays) -> Tensor:
-        """Return as many samples as the length of a ray's path through the shell requires."""
+    def rendering_draws(self, scene: PosedScene[ShellGrid], rays: Rays) -> Draws:
+        """Return the draws of samples SPACING_M apart, closer where pixels are small."""
         length_m, start_m = scene.region.path_m(rays)
         spacing_m = torch.full_like(start_m, SPACING_M)
         if scene.pixel_rad is not None:
             spacing_m = (SPACING_PX * scene.pixel_rad * start_m).clamp(MIN_SPACING_M, SPACING_M)
-        needed = length_m / spacing_m
-        steps = torch.tensor(SAMPLE_COUNTS, device=needed.device)
-        enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLE_COUNTS) - 1)
-        return torch.where(needed > 0, steps[enough], 0)
+        most = int((length_m / spacing_m).ceil().amax().clamp(MIN_SAMPLES, MOST_RENDERED))
+        return Draws.deterministic(len(rays), most, length_m.device, spacing_m)
 
     def _deformed(self, described: Descriptor, frame_row: Tensor) -> tuple[Descriptor, Tensor | None]:
         """Return descriptors (N,) relative to the body as frames `frame_row` (N,) deform it, and the displacements (N,
@@ -357,7 +352,8 @@ def on_same_limb(described: Descriptor, ends: Tensor) -> Tensor:
 
 def least_around(described: Descriptor, d_hat: Tensor, ends: Tensor) -> Tensor:
     """Replace d_hat (N,) at samples that are closer to their limb than both neighbours by the least of the parabola
-    through the three: a ray that passes a finger is closest to it between two samples. ends: as in `on_same_limb`."""
+    through the three, as if they were evenly spaced: a ray that passes a finger is closest to it between two samples.
+    ends: as in `on_same_limb`."""
     if len(d_hat) < 3:
         return d_hat
     same_limb = on_same_limb(described, ends)
@@ -367,9 +363,9 @@ def least_around(described: Descriptor, d_hat: Tensor, ends: Tensor) -> Tensor:
     return d_hat - nn.functional.pad(torch.where(closest, deeper_m, 0.0), (1, 1))
 
 
-def move_to_surface(described: Descriptor, d_hat: Tensor, ends: Tensor) -> Descriptor:
-    """Move samples (N,) along their rays to where d_hat (N,), linear between samples, is zero or closest to it. ends:
-    as in `on_same_limb`.
+def move_to_surface(described: Descriptor, d_hat: Tensor, depth_m: Tensor, ends: Tensor) -> tuple[Descriptor, Tensor]:
+    """Move samples (N,) at depths (N,) along their rays to where d_hat (N,), linear between samples, is zero or closest
+    to it; also return the new depths. ends: as in `on_same_limb`.
 
     A sample's opacity is that of the path to the next sample; its colour is that of the surface that makes this path
     opaque. If the next sample is nearer to another limb's surface, or is the first within reach, it is that surface:
@@ -393,5 +389,6 @@ def move_to_surface(described: Descriptor, d_hat: Tensor, ends: Tensor) -> Descr
         return torch.cat([torch.lerp(values[:-1], values[1:], share), values[-1:]]).index_select(0, source)
 
     corners, barycentric = (t.index_select(0, source) for t in (described.corners, described.barycentric))
-    d = moved(described.d[:, None])[:, 0]
-    return dataclasses.replace(described, y=moved(described.y), d=d, corners=corners, barycentric=barycentric)
+    d, depth_m = moved(torch.stack([described.d, depth_m], 1)).unbind(1)
+    surface = dataclasses.replace(described, y=moved(described.y), d=d, corners=corners, barycentric=barycentric)
+    return surface, depth_m

@@ -17,7 +17,7 @@ from hnerf.segmentation.edge import shaded_plate
 from hnerf.segmentation.prior import bounding_window
 from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import CELL_PX, Pixels
-from hnerf.training.plates import plates_of
+from hnerf.training.plates import Plate, plates_of
 
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and background
 SUFFIX = ".pixels"  # of the files that hold the columns of Pixels; COLUMNS: the columns' types and widths
@@ -43,9 +43,11 @@ def gather_pixels(
     gains: Gains,
     folder: Path,
     processes: Distributed,
+    with_plates: bool = True,
 ) -> Pixels:
     """Gather the training cameras' pixels in the fit's frames that can show the body or lie on the mask; none where the
-    mask was dropped. visible_pixels None: all pixels, without plates, for a field that models the background.
+    mask was dropped. visible_pixels None: all pixels. with_plates: whether the person is composited over plates, which
+    a field that models the background does not need.
 
     Colours and plates are divided by the gains of their cameras, if any, as if all were exposed alike. One process
     gathers, image by image, into files in `folder`; all processes map them, so that the machine holds them once and may
@@ -56,7 +58,8 @@ def gather_pixels(
         if processes.is_main:
             folder.mkdir(parents=True, exist_ok=True)
             _remove(folder)  # what a killed process left
-            _write_pixels(capture, masks, body, visible_pixels, gains, folder)
+            plates = plates_of(capture, masks, body.frames) if with_plates else None
+            _write_pixels(capture, masks, body, visible_pixels, plates, gains, folder)
         processes.barrier()
         columns: dict[str, Any] = {name: _mapped(folder / f"{name}{SUFFIX}", *kind) for name, kind in COLUMNS.items()}
         processes.barrier()
@@ -77,12 +80,12 @@ def _write_pixels(
     masks: Masks,
     body: BodyFit,
     visible_pixels: ReachablePixels | None,
+    plates: list[Plate] | None,
     gains: Gains,
     folder: Path,
 ) -> None:
     """Write the columns of Pixels, one file each, frame by frame."""
     cameras = [capture.cameras[name] for name in capture.train_cameras]
-    plates = plates_of(capture, masks, body.frames) if visible_pixels else None
     columns, cells = _Columns(folder), 0
     for frame, vertices_m in zip(body.frames, body.vertices_m().numpy(), strict=True):
         for c, camera in enumerate(cameras):

@@ -25,9 +25,10 @@ class PixelRays(Rays):
 
 
 class CellErrors:
-    """The colour errors that training saw last, by cell.
+    """The colour errors of training, by cell of the image.
 
-    mean (C,): 0 in cells that no ray has met. A new error counts as much as all earlier ones.
+    mean (C,): in each step, the mean of a cell's errors and of what it had before, which counts as one more error; 0 in
+    cells that no ray has met.
     """
 
     def __init__(self, cells: int):

@@ -82,8 +82,9 @@ class Trainer:
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
         logger.info("gathering pixels")
         visible_pixels = None if self.field.whole_images else self.field.visible_pixels
-        self.pixels = gather_pixels(capture, masks, body, visible_pixels, self.gains, out, processes)
-        uniform, cell = self.field.models_background, self.pixels.cell  # the paper draws uniformly
+        uniform = self.field.models_background  # as the paper draws
+        self.pixels = gather_pixels(capture, masks, body, visible_pixels, self.gains, out, processes, not uniform)
+        cell = self.pixels.cell
         self.errors = None if uniform or cell is None else CellErrors(int(cell.max()) + 1)
         seen = self.pixels.starts.diff() > 0  # False where all masks of a frame were dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}

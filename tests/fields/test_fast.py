@@ -13,10 +13,9 @@ from hnerf.config import FastFieldSettings
 from hnerf.fields.base import Field, composited
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.fast import (
-    SAMPLE_COUNTS,
+    MOST_RENDERED,
     SATURATED_LOGIT,
     SHELL_MARGIN_M,
-    SPACING_M,
     TIGHTEN_STEP_M,
     FastField,
     least_around,
@@ -134,9 +133,9 @@ def test_pixels_within_the_shell_and_a_cell_are_visible():
     assert np.flatnonzero(seen[20]).tolist() == [*range(17, 24)]
 
 
-def test_adaptive_sample_counts_render_the_same_as_many_samples(monkeypatch: pytest.MonkeyPatch):
-    """Straight and slanted rays with different path lengths in the shell, and one that misses it, agree with 32 samples
-    each."""
+def test_as_many_samples_as_paths_require_render_the_same_as_many():
+    """Straight and slanted rays with different path lengths in the shell, and one that misses it, agree with samples
+    1 mm apart. Each sees the same alone as among others."""
     bodies, conditions = standing()
     field = field_of(200.0)
     origins = torch.tensor([[0.5, 0.4, 3.0], [0.02, 0.9, 3.0], [0.5, 0.1, 3.0], [2.0, 0.5, 3.0]])
@@ -144,25 +143,37 @@ def test_adaptive_sample_counts_render_the_same_as_many_samples(monkeypatch: pyt
     directions = torch.nn.functional.normalize(directions, dim=-1)
     rays = Rays(origins, directions, torch.zeros(4, dtype=torch.long))
     scene = field.scene(bodies, conditions)
-    needed = scene.region.path_m(rays)[0] / SPACING_M
-    assert len({sum(float(n) > count for count in SAMPLE_COUNTS) for n in needed}) >= 3
     found = field.render_rays(scene, rays)
-    monkeypatch.setattr(FastField, "samples_needed", Field.samples_needed)
-    expected = field.render_rays(scene, rays)
-    torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
+    many = field.sample(scene, rays, Draws.deterministic(4, 512, torch.device("cpu"), 0.001))
+    torch.testing.assert_close(found, composited(*many), atol=0.02, rtol=0)
     assert (found[:3, 3] > 0.5).all() and not found[3].any()
+    for k in range(4):
+        torch.testing.assert_close(field.render_rays(scene, rays.pick(torch.tensor([k])))[0], found[k])
 
 
 @pytest.mark.parametrize(
-    ("pixel_m", "samples"), [(None, 12), (0.1, 12), (0.003, 12), (0.002, 18), (0.001, 36), (1e-6, 36)]
+    ("path_m", "pixel_m", "samples"),
+    [(0.1, None, 10), (0.1, 0.1, 10), (0.1, 0.002, 13), (0.1, 1e-6, 34), (0.04, None, 6), (9.0, None, MOST_RENDERED)],
 )
-def test_samples_are_four_pixels_apart_in_close_ups(pixel_m: float | None, samples: int):
-    """10 cm of shell in samples of 12 mm, of 8 mm if a pixel covers 2 mm, and of 3 mm at the closest are 8.3, 12.5 and
-    33.3 samples."""
-    region = SimpleNamespace(path_m=lambda rays: (torch.tensor([0.1]), torch.tensor([2.0])))
+def test_samples_are_four_pixels_apart_in_close_ups(path_m: float, pixel_m: float | None, samples: int):
+    """10 cm of shell in samples of 10 mm, of 8 mm if a pixel covers 2 mm, and of 3 mm at the closest are 10, 12.5 and
+    33.3 samples. No ray has fewer than 6."""
+    region = SimpleNamespace(path_m=lambda rays: (torch.tensor([path_m - 1e-6]), torch.tensor([2.0])))
     bodies, conditions = standing()
     scene = PosedScene(bodies, region, conditions, pixel_rad=pixel_m and pixel_m / 2)
-    assert field_of(200.0).samples_needed(scene, from_above((0.5, 0.5, 3.0))).tolist() == [samples]
+    draws = field_of(200.0).rendering_draws(scene, from_above((0.5, 0.5, 3.0)))
+    assert draws.jitter.shape == (1, samples) and draws.spacing_m is not None
+    assert draws.spacing_m.item() == pytest.approx(min(0.01, max(0.003, 4 * (pixel_m or 1))))
+
+
+@pytest.mark.parametrize("sharpness_per_m", [100.0, 2000.0])
+def test_depth_is_that_of_the_surface(sharpness_per_m: float):
+    """The top of the box is at z = 1 m, 2 m below the camera."""
+    bodies, conditions = standing()
+    field = field_of(sharpness_per_m)
+    rays = from_above((0.5, 0.4, 3.0), (0.31, 0.62, 3.0013), (0.5, 0.5, 3.007))
+    depth_m = field.render_rays(field.scene(bodies, conditions), rays)[:, 4]
+    torch.testing.assert_close(depth_m, rays.origins_m[:, 2] - RIG.vertices_m[:, 2].max(), atol=1e-3, rtol=0)
 
 
 def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
@@ -182,15 +193,15 @@ def test_rendered_rays_end_at_the_solid_core_if_the_surface_lies_deeper():
     field = deeper_by(0.1)
     rays = from_above((0.5, 0.5, 3.0), (-0.05, 0.5, 3.0))
     scene = field.scene(bodies, conditions)
-    count = int(field.samples_needed(scene, rays)[0])
-    draws = Draws.deterministic(2, count, torch.device("cpu"))
     with torch.no_grad():
+        draws = field.rendering_draws(scene, rays)
+        _, (last, _), _ = scene.region.sample_rays(rays, draws.jitter, draws.spacing_m)
         samples, depths = field.sample(scene, rays, draws)
         seen = field.render_rays(scene, rays)
     assert samples.d_hat.min() > 0.02 and field.coverage(samples).max() < 0.01
-    assert seen[0, 3] == pytest.approx(1) and seen[0, 4] == pytest.approx(depths[0, -1].item(), abs=1e-4)
-    torch.testing.assert_close(seen[0, :3], samples.colour[0, -1], atol=1e-3, rtol=0)
-    assert samples.colour[0, -1].min() > 0 and seen[1, 3] < 0.01
+    assert seen[0, 3] == pytest.approx(1) and seen[0, 4] == pytest.approx(depths[0, last - 1].item(), abs=1e-4)
+    torch.testing.assert_close(seen[0, :3], samples.colour[0, last - 1], atol=1e-3, rtol=0)
+    assert samples.colour[0, last - 1].min() > 0 and seen[1, 3] < 0.01
 
 
 def test_a_shell_with_more_depth_than_height_finds_a_deep_surface():
@@ -333,12 +344,17 @@ def last_of(*counts: int) -> torch.Tensor:
     return torch.cat([torch.arange(count) == count - 1 for count in counts])
 
 
+def on_surface(described: Descriptor, d_hat: torch.Tensor, ends: torch.Tensor) -> Descriptor:
+    return move_to_surface(described, d_hat, -described.d, ends)[0]
+
+
 def test_samples_in_front_of_the_surface_move_onto_it():
     """Samples lie at 12, 6, -2 and -8 mm above the skin, the surface at 1 mm. The second sample moves 5 / 8 of the way
     to the third, and the first moves to the second. Those behind the surface stay."""
     described = on_a_ray([0.012, 0.006, -0.002, -0.008], [True] * 4)
-    moved = move_to_surface(described, described.d - 0.001, last_of(4))
+    moved, depth_m = move_to_surface(described, described.d - 0.001, -described.d, last_of(4))
     expected = torch.tensor([0.006, 0.001, -0.002, -0.008])
+    assert torch.allclose(depth_m, -expected, atol=1e-7)
     assert torch.allclose(moved.d, expected, atol=1e-7)
     assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
 
@@ -346,7 +362,7 @@ def test_samples_in_front_of_the_surface_move_onto_it():
 def test_samples_stay_if_the_next_is_out_of_reach_or_near_another_limb():
     described = on_a_ray([0.005, -0.005, 0.005, 0.006], [True, False, True, True])
     described.y[3, 0] = 0.1
-    moved = move_to_surface(described, described.d, last_of(4))
+    moved = on_surface(described, described.d, last_of(4))
     for name in ("d", "y", "corners", "barycentric"):
         assert torch.equal(getattr(moved, name), getattr(described, name))
 
@@ -359,7 +375,7 @@ def test_a_sample_in_front_of_another_limb_moves_onto_that_limb(first_near):
     described = on_a_ray([0.005, -0.001, -0.006], [first_near, True, True])
     described.y[1:, 0] = 0.1
     described.corners[1:], described.barycentric[1:] = 7, 0.5
-    moved = move_to_surface(described, described.d, last_of(3))
+    moved = on_surface(described, described.d, last_of(3))
     on_trunk = torch.tensor([[0.1, 0, 0], [0.1, 0, 0], [0.1, 0, -0.006]])
     torch.testing.assert_close(moved.y, on_trunk, atol=1e-7, rtol=0)
     torch.testing.assert_close(moved.d, on_trunk[:, 2], atol=1e-7, rtol=0)
@@ -393,7 +409,7 @@ def test_the_surface_point_moves_correctly_with_its_body():
         d = height + points_on_rays + down
         y = torch.stack([x - points_on_rays, torch.zeros_like(x), d], 1)
         described = dataclasses.replace(on_a_ray([0.0, 0.0], [True] * 2), d=d, y=y)
-        return move_to_surface(described, d, last_of(2)).y[0]
+        return on_surface(described, d, last_of(2)).y[0]
 
     still = torch.zeros((), dtype=torch.double, requires_grad=True)
     skin = torch.tensor([0.003, 0.0, 0.0], dtype=torch.double)
@@ -431,7 +447,7 @@ def test_colour_gradients_by_the_body_position_match_finite_differences():
 def test_a_ray_that_grazes_the_surface_has_finite_gradients():
     described = on_a_ray([0.001, 0.001, 0.0, 0.0], [True] * 4)
     d_hat = described.d.clone().requires_grad_()
-    move_to_surface(described, d_hat, last_of(4)).y.sum().backward()
+    on_surface(described, d_hat, last_of(4)).y.sum().backward()
     assert d_hat.grad is not None
     assert torch.isfinite(d_hat.grad).all()
 
@@ -441,17 +457,17 @@ def test_samples_of_other_rays_are_no_neighbours() -> None:
     another limb."""
     low = [0.012, 0.006, -0.002, -0.008]
     described = on_a_ray([*low, *low], [True] * 8)
-    moved = move_to_surface(described, described.d - 0.001, last_of(4, 4))
+    moved = on_surface(described, described.d - 0.001, last_of(4, 4))
     torch.testing.assert_close(moved.d, torch.tensor([0.006, 0.001, -0.002, -0.008] * 2), atol=1e-7, rtol=0)
     apart = on_a_ray([0.004, 0.002, -0.003, -0.006], [True] * 4)
     apart.y[2:, 0] = 0.1
-    moved = move_to_surface(apart, apart.d, last_of(2, 2))
+    moved = on_surface(apart, apart.d, last_of(2, 2))
     torch.testing.assert_close(moved.d, torch.tensor([0.002, 0.002, -0.003, -0.006]), atol=1e-7, rtol=0)
 
 
 def test_samples_stay_if_the_ray_moves_away_from_the_surface():
     described = on_a_ray([0.001, 0.004, 0.004, 0.009], [True] * 4)
-    assert torch.equal(move_to_surface(described, described.d, last_of(4)).d, described.d)
+    assert torch.equal(on_surface(described, described.d, last_of(4)).d, described.d)
 
 
 def test_the_distance_is_the_minimum_over_limbs() -> None:

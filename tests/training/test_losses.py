@@ -27,7 +27,7 @@ SAMPLES = RaySamples(
     elastic=torch.tensor([0.2]),
 )
 TARGET = Target(colour=torch.tensor([RED, BLACK]), person=torch.tensor([1.0, 0.0]), weight=torch.ones(2))
-DOUBLE = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
+DOUBLE = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items() if v is not None})
 DOUBLE_TARGET = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
 
 

@@ -112,14 +112,14 @@ def test_camera_and_position_of_a_pixel_follow_from_its_index() -> None:
 
 @pytest.mark.parametrize("visible_pixels", [REACHED, None])
 def test_gathered_pixels_equal_those_of_the_images(tmp_path: Path, visible_pixels: ReachablePixels | None) -> None:
-    """Without a visibility function, all pixels are used, and there are no plates."""
+    """Without a visibility function, all pixels are used."""
     capture, masks, body = record(tmp_path)
     out = tmp_path / "out"
     out.mkdir()
     (out / "plate.pixels").write_bytes(b"of a process that was killed")
     pixels = gather_pixels(capture, masks, body, visible_pixels, {}, out, ALONE)
     assert not any(out.iterdir())
-    assert (pixels.pixel_index is None) == (pixels.plate is None) == (visible_pixels is None)
+    assert (pixels.pixel_index is None) == (visible_pixels is None)
     camera, xy_px = pixels.cameras_and_xy(torch.arange(len(pixels.person)))
     row = torch.arange(len(body.frames)).repeat_interleave(pixels.starts.diff())
     for c, name in enumerate(capture.train_cameras):
@@ -169,7 +169,7 @@ def test_outline_pixels_with_an_unknown_background_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The background of one camera is unknown: only its outline pixels are left out, not its other pixels nor those of
-    other cameras."""
+    other cameras. A field that models the background needs no plates, and gets all pixels."""
     capture, masks, body = record(tmp_path)
     every = gather_pixels(capture, masks, body, REACHED, {}, tmp_path, ALONE)
     plates = plates_of(capture, masks, body.frames) or []
@@ -178,6 +178,8 @@ def test_outline_pixels_with_an_unknown_background_are_left_out(
     some = gather_pixels(capture, masks, body, REACHED, {}, tmp_path, ALONE)
     left_out = every.edge & (every.cameras_and_xy(torch.arange(len(every.edge)))[0] == 1)
     assert left_out.any() and torch.equal(some.colour, every.colour[~left_out])
+    without_plates = gather_pixels(capture, masks, body, REACHED, {}, tmp_path, ALONE, with_plates=False)
+    assert without_plates.plate is None and torch.equal(without_plates.colour, every.colour)
 
 
 def test_edges_extend_two_pixels_inwards_and_outwards(tmp_path: Path):

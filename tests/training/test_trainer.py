@@ -367,8 +367,8 @@ def test_a_full_disk_is_an_os_error_and_leaves_no_partial_checkpoint(tmp_path: P
 
 
 def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path):
-    """The published method draws uniformly from all pixels; a composited field needs pixels near the person, more of
-    them where its colours are wrong."""
+    """The published method draws uniformly from all pixels, without plates; a composited field needs pixels near the
+    person, more of them where its colours are wrong."""
     scene = record(tmp_path)
     height, width = scene[0].image("0", 0).shape[:2]
     images = len(scene[0].train_cameras) * len(scene[2].frames)
@@ -381,6 +381,7 @@ def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path)
         trainer = Trainer(*scene, settings, tmp_path / "out", ALONE)
         assert (len(trainer.pixels.edge) == images * height * width) == whole
         assert (trainer.errors is None) == uniform
+        assert (trainer.pixels.plate is None) == trainer.field.models_background
 
 
 def test_the_number_of_rays_per_step_does_not_depend_on_the_number_of_frames(
