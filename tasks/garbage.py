@@ -18,7 +18,7 @@ from pathlib import Path
 from tasks.inventory import KEY, Inventory, in_stages
 from tasks.store import Store, remove
 
-LEFT = re.compile(rf"({KEY.pattern})(\.partial|\.json\.partial|\.moving|\.shared|\.lock|\.json|)")
+LEFT = re.compile(rf"({KEY.pattern})(\.partial|\.json\.partial|\.moving|\.old|\.shared|\.lock|\.json|)")
 
 
 @dataclass(frozen=True)

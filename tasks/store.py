@@ -4,6 +4,7 @@
     <store>/<stage>/<key>.json      the record: each file's SHA-256 and size, and a few metrics
     <store>/<stage>/<key>.partial/  work in progress
     <store>/<stage>/<key>.moving/   on its way into or out of a bucket (tasks/shared.py) or archive (tasks/archive.py)
+    <store>/<stage>/<key>.old/      damaged files that were replaced, until they are removed
     <store>/<stage>/<key>.shared    which of its checkpoints a bucket has (tasks/shared_checkpoint.py)
     <store>/<stage>/<key>.lock      locked (flock) by a process that works on the key; if it dies, the kernel unlocks it
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
@@ -31,6 +32,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Annotated
+from uuid import uuid4
 
 from pydantic import BaseModel, Field, FiniteFloat
 
@@ -41,7 +43,7 @@ from tasks.pins import pin, unless_read_only
 log = logging.getLogger("hnerf.store")
 
 RECORDING = ".recording"  # under subjects/<name>: digest and folder of the recording
-SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving", ".shared")  # a key may have, besides its lock
+SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving", ".old", ".shared")  # a key may have, besides its lock
 MAX_RECORD_BYTES = 256_000_000  # a million files need half of this
 ATTEMPTS = 100  # to lock a key in a folder that other processes create and remove
 # In order: each stage is computed from those before it.
@@ -308,7 +310,7 @@ class Store:
         process."""
         pin(self.root, artifact.name)
         stage, key = artifact.stage, artifact.root.name
-        partial, folder, record = (self.path(stage, key, suffix) for suffix in (".partial", "", ".json"))
+        partial, folder, record, old = (self.path(stage, key, suffix) for suffix in (".partial", "", ".json", ".old"))
         kept = set(partial.glob(f"{checkpoint}*")) if checkpoint else set()
         paths = sorted(set(partial.rglob("*")) - kept)
         sizes_bytes = {path: _flush(path) for path in [partial, *paths]}
@@ -323,10 +325,14 @@ class Store:
         with beside.open("x") as file:
             file.write(artifact.model_dump_json(indent=1, exclude={"root"}))
         _flush(beside)
-        remove(folder)
+        if os.path.lexists(folder):  # out of the way at once: it may not be possible to empty it while files are open
+            remove(old)
+            old.mkdir(exist_ok=True)
+            os.replace(folder, old / uuid4().hex)
         # The record comes first: if the process is killed before the folder is in place, the work can be resumed.
         os.replace(beside, record)
         os.replace(partial, folder)
+        remove(old)
         if checkpoint:
             remove_checkpoint(folder, checkpoint)
         _flush(folder.parent)

@@ -492,6 +492,7 @@ FAULTS = (
     Fault("key-ignores-version", "tasks/policy", '"version": version, ', ""),
     Fault("store-lock-link", "tasks/store", "flags | os.O_NOFOLLOW", "flags"),
     Fault("store-planted-links", "tasks/store", "for path in partial.rglob(\"*\"):", "for path in list[Path]():"),
+    Fault("store-replaced-twice", "tasks/store", "old / uuid4().hex", 'old / "one"'),
     Fault("ledger-key", "tasks/ledger", "lost.read_text() if lost.exists() else ''", "''"),
     Fault("ledger-empty-note", "tasks/ledger", 'or "none")', 'or "")'),
     Fault("store-bad-input", "tasks/store",

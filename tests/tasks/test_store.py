@@ -15,6 +15,8 @@ from unittest.mock import Mock
 import pytest
 
 from hnerf.errors import InputError
+from tasks.garbage import collect, find_garbage
+from tasks.inventory import Inventory
 from tasks.store import RECORDING, Artifact, Store, recording_digest, remove, require_intact
 
 # Not forked: a child would inherit the state of Prefect's threads, but not the threads.
@@ -199,12 +201,30 @@ def test_a_damaged_or_deleted_artifact_is_computed_again(
     assert Store(tmp_path).find("fit", "k") == made
 
 
+def test_a_damaged_artifact_that_cannot_be_emptied_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file that another process holds open stays as `.nfs...` on NFS. What is left is garbage, and the next damage is
+    mended, too."""
+    monkeypatch.setattr("tasks.store.pin", lambda *_: None)  # it would count as in use
+    store, key = Store(tmp_path), f"{1:032x}"
+    store.get_or_compute("fit", key, write_abc)
+    with monkeypatch.context() as patch:
+        patch.setattr("tasks.store.remove", lambda folder: None)
+        for _ in range(2):
+            letters = store.path("fit", key) / "deep" / "letters"
+            letters.write_text("abd")
+            made = store.get_or_compute("fit", key, write_abc, resumable=True)
+            assert letters.read_text() == "abc" and store.find("fit", key) == made
+    (left,) = [one for one in find_garbage(Inventory.of(store), 1, 0) if one.what == "leftover"]
+    assert collect(store, left) and store.find("fit", key) == made
+    assert sorted(path.name for path in (tmp_path / "fit").iterdir()) == [key, f"{key}.json", f"{key}.lock"]
+
+
 def test_links_planted_in_the_store_are_not_followed(tmp_path: Path) -> None:
     victim, fit = tmp_path / "victim", tmp_path / "store" / "fit"
     (victim / "deep").mkdir(parents=True)
     (victim / "letters").write_text("mine")
     fit.mkdir(parents=True)
-    for name in ("k.partial", "k"):
+    for name in ("k.partial", "k", "k.old"):
         (fit / name).symlink_to(victim)
     (fit / "k.json.partial").symlink_to(victim / "letters")
     made = Store(tmp_path / "store").get_or_compute("fit", "k", write_abc, resumable=True)
