@@ -19,12 +19,11 @@ from hnerf.asset.compact_glb import compact_glb
 from hnerf.asset.levels import Level
 from hnerf.asset.staging import opengl_pose
 from hnerf.capture.capture import Capture
-from hnerf.errors import InputError
 from hnerf.evaluation.pictures import data_uri, shrunk
 from hnerf.evaluation.report import report_environment
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
-from hnerf.models import LICENCES, THREE_SHA256, model_file
+from hnerf.models import ADVICE, LICENCES, THREE_SHA256, has_model, model_file
 
 PAGE = Path(__file__).parent / "page"
 MAX_BYTES = 8_000_000
@@ -38,16 +37,14 @@ log = logging.getLogger("hnerf.asset")
 
 
 def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.ndarray, levels: Sequence[Level]) -> str:
-    """Write the page of an avatar. Return its name, or, if it cannot be written, the reason in one line, which is
-    logged, too.
+    """Write the page of an avatar. Return its name, or, if three.js is not installed, a line that says so, which is
+    logged, too. Raises InputError if a file of three.js is altered.
 
     stage_from_world (3, 3): from the capture's world to the avatar's; levels: of detail, the first that of the file.
     The texture is halved until the page has at most MAX_BYTES; if that does not suffice, a warning is logged.
     """
-    try:
-        modules = _modules()
-    except InputError as error:
-        reason = f"no {path.name}: {error}"
+    if not all(map(has_model, THREE_SHA256)):
+        reason = f"no {path.name}: three.js is not installed; {ADVICE}"
         log.warning("%s", reason)
         return reason
     parts: dict[str, Any] = {
@@ -55,7 +52,7 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
         "style": (PAGE / "viewer.css").read_text(encoding="utf-8"),
         "boot": (PAGE / "boot.js").read_text(encoding="utf-8"),
         "licence": (LICENCES / "three.txt").read_text(encoding="utf-8"),
-        "modules": _packed(json.dumps(modules).encode()),
+        "modules": _packed(json.dumps(_modules()).encode()),
         "levels": _packed(json.dumps(lower_indices(levels)).encode()),
         "recording": _packed(json.dumps(recording(capture, stage_from_world)).encode()),
     }

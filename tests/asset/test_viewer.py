@@ -18,6 +18,7 @@ from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.viewer import MAX_BYTES, _modules, lower_indices, recording, write_viewer
 from hnerf.capture.capture import Capture
+from hnerf.errors import InputError
 from hnerf.evaluation.pictures import cast_pixels
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.models import THREE_SHA256, has_model
@@ -70,17 +71,20 @@ def page(viewer: Path) -> Iterator[Page]:
         yield opened
 
 
-def test_without_intact_three_js_a_reason_is_given_and_no_page_is_written(
+def test_without_three_js_no_page_is_written_and_an_altered_one_is_refused(
     staged: StagedAvatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    models = tmp_path / "models"
-    monkeypatch.setenv("HNERF_MODELS", str(models))
-    page = tmp_path / "viewer.html"
-    for found in ("not there", "altered or damaged"):
-        reason = write_viewer(page, tmp_path / "avatar.glb", capture(), staged.stage_from_world, [])
-        assert reason == f"no viewer.html: {models}/{next(iter(THREE_SHA256))}: {found}; run `hnerf models`"
-        models.mkdir(exist_ok=True)
-        (models / next(iter(THREE_SHA256))).write_text("// an older version")
+    """The stage's key depends on which files there are, so a page left out for another reason would stay away."""
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path))
+    page, glb = tmp_path / "viewer.html", tmp_path / "avatar.glb"
+    *others, last = THREE_SHA256
+    for name in others:
+        (tmp_path / name).write_text("// an older version")
+    reason = write_viewer(page, glb, capture(), staged.stage_from_world, [])
+    assert reason == "no viewer.html: three.js is not installed; run `hnerf models`"
+    (tmp_path / last).write_text("// an older version")
+    with pytest.raises(InputError, match=rf"/{others[0]}: altered or damaged; run `hnerf models`$"):
+        write_viewer(page, glb, capture(), staged.stage_from_world, [])
     assert not page.exists()
 
 
