@@ -343,10 +343,12 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
 def preset_tree(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
     """Return the tree of a preset's file, merged over that of the preset that it is `based_on`, if any: a name, or a
     path in the same folder or the working directory. derived: the presets that are based on this one. Raises InputError
-    if it is among them."""
+    if it is among them, or holds no keys."""
     if path.resolve() in derived:
         raise InputError(f"{path}: is based on itself; correct based_on in it")
     tree = read_yaml(path)
+    if not tree:
+        raise InputError(f"{path}: holds no settings; write some, or a line like `based_on: fast`")
     base = tree.pop("based_on", None)
     if base is None:
         return tree

@@ -155,6 +155,15 @@ def test_a_preset_builds_on_another(tmp_path: Path) -> None:
         load_settings(str(path))
 
 
+@pytest.mark.parametrize("content", [b"", b"# training: {steps: 7}", b"\xff\xfe", b"{}"])
+def test_a_preset_without_settings_is_refused(tmp_path: Path, content: bytes) -> None:
+    """An editor or a full disk left it empty, so its defaults are not meant; nor are those of `fast`."""
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"^{path}: holds no settings; write some, or a line like `based_on: fast`$"):
+        load_settings(str(path), ["training.steps=7"])
+
+
 def test_a_preset_cannot_build_on_itself(tmp_path: Path) -> None:
     one, other = tmp_path / "one.yaml", tmp_path / "other.yaml"
     one.write_text(f"based_on: {other}")
@@ -171,7 +180,7 @@ def test_a_large_file_is_not_read_as_a_preset(tmp_path: Path) -> None:
     for name in (path, tmp_path / "mine.yaml"):
         with pytest.raises(InputError, match=rf"^{path}: more than 65536 bytes; give a YAML file of settings$"):
             load_settings(str(name))
-    path.write_bytes(b"#" * 65_536)
+    path.write_text("training: {} ".ljust(65_536, "#"))
     assert load_settings(str(path)) == Settings()
 
 
