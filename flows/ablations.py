@@ -13,7 +13,7 @@ from typing import Any
 from prefect import flow
 
 from flows.arguments import StoreFolder
-from flows.preparation import ingest_recording, prepare_training, refuse_held_out_cameras, with_detections
+from flows.preparation import check_presets, ingest_recording, prepare_training, with_detections
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, title_of, with_changes
@@ -78,8 +78,8 @@ def ablate(
 
 def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], dict[str, str]]:
     """Return the settings of each row, the full method first, and why other ablations have no row. Raises InputError
-    for unknown names, and for settings that leave a camera out."""
-    refuse_held_out_cameras([full])
+    for unknown names, and for settings that no study accepts."""
+    check_presets([full])
     known = {path.stem: path for path in sorted(ABLATIONS.glob("*.yaml"))}
     unknown = sorted(set(only) - set(known))
     if unknown:

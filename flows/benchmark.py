@@ -9,7 +9,7 @@ from prefect import flow
 from pydantic import Field
 
 from flows.arguments import StoreFolder
-from flows.preparation import Prepared, ingest_part, ingest_recording, prepare_training, refuse_held_out_cameras
+from flows.preparation import Prepared, check_presets, ingest_part, ingest_recording, prepare_training
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, title_of
@@ -56,7 +56,7 @@ def benchmark(
     whole = load_study(study)
     plan = whole.restricted_to(methods or [], seconds)
     presets = [plan.settings(name) for name in plan.methods]  # invalid presets are refused first
-    refuse_held_out_cameras(presets)
+    check_presets(presets)
     set_limits(presets[0].limits)
     artifact_store = Store(store.resolve())
     source, truth = retried(read_capture)(capture, store)

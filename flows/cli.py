@@ -15,7 +15,7 @@ from flows.arguments import MAX_COUNT, number, path, path_or_bucket_url
 from flows.display import display
 from flows.ending import Terminated, drop_what_is_left, open_closed_streams, unwound_by_signals
 from flows.store_commands import add_store_commands
-from hnerf.config import load_settings
+from hnerf.config import load_settings, require_named_files
 from hnerf.errors import DISK_FULL, REASON, UNREACHABLE, InputError, InvalidAsset
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
@@ -126,7 +126,9 @@ def _reader_has_left() -> bool:
 def _existing(options: argparse.Namespace) -> list[Path]:
     """Return the folders that a command reads. Raises InputError for faults that can be found without slow imports."""
     if "preset" in options:
-        load_settings(options.preset, getattr(options, "overrides", ()))
+        settings = load_settings(options.preset, getattr(options, "overrides", ()))
+        if "capture" in options:
+            require_named_files(settings)
     folders = {what: given for name, what in FOLDERS.items() if isinstance(given := getattr(options, name, None), Path)}
     for what, folder in folders.items():
         if not (folder.is_dir() or (what == FOLDERS["capture"] and folder.is_file())):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import lacks_calibration
-from hnerf.config import Settings
+from hnerf.config import Settings, require_named_files
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import CapturePart
 from tasks.calibration import calibrate
@@ -29,10 +29,13 @@ class Prepared(NamedTuple):
     body: Artifact
 
 
-def refuse_held_out_cameras(presets: Iterable[Settings]) -> None:
-    """Raise InputError if a preset of a study leaves a camera out: studies would train with it all the same."""
-    if any(preset.evaluation.holdout is not None for preset in presets):
-        raise InputError("evaluation.holdout: only `hnerf run` leaves cameras out; remove it")
+def check_presets(presets: Iterable[Settings]) -> None:
+    """Raise InputError if a preset of a study names a file that is not there, or leaves a camera out: studies would
+    train with it all the same."""
+    for preset in presets:
+        require_named_files(preset)
+        if preset.evaluation.holdout is not None:
+            raise InputError("evaluation.holdout: only `hnerf run` leaves cameras out; remove it")
 
 
 def missing_cameras(store: Store, source: Source) -> Artifact | None:

@@ -11,7 +11,7 @@ from typing import Any
 from prefect import flow
 
 from flows.arguments import StoreFolder
-from flows.preparation import Prepared, ingest_part, prepare_training, refuse_held_out_cameras
+from flows.preparation import Prepared, check_presets, ingest_part, prepare_training
 from flows.run_page import publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
@@ -75,7 +75,7 @@ def stability(
     plan = whole.restricted_to(only)
     plan = plan.model_copy(update={"methods": tuple(dict.fromkeys(methods))}) if methods else plan
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
-    refuse_held_out_cameras(presets.values())
+    check_presets(presets.values())
     artifact_store = Store(store.resolve())
     source, truth = retried(read_capture)(capture, store)
     subject = Capture.load(ingest_part(artifact_store, source, plan.part, next(iter(presets.values()))).root).name

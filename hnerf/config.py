@@ -340,6 +340,15 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
     return overridden(validated(Settings, preset_tree(path), path), overrides)
 
 
+def require_named_files(settings: Settings) -> None:
+    """Raise InputError if a file that a setting names is not there: its stage would find that out only after those
+    before it."""
+    for section, values in settings:
+        for name, value in values:
+            if isinstance(value, Path) and not value.is_file():
+                raise InputError(f"{section}.{name}: {value}: no such file; correct the path, or leave it out")
+
+
 def preset_tree(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
     """Return the tree of a preset's file, merged over that of the preset that it is `based_on`, if any: a name, or a
     path in the same folder or the working directory. derived: the presets that are based on this one. Raises InputError

@@ -252,6 +252,21 @@ def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: 
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]
 
 
+@pytest.mark.parametrize("command", ["run", "check-cameras"])
+@pytest.mark.parametrize("key", ["fit.body_model", "segmentation.model", "detection.model"])
+def test_a_file_that_a_setting_names_is_missed_before_any_stage(
+    command: str, key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_easymocap(tmp_path / "ada")
+    section, name = key.split(".")
+    Path("mine.yaml").write_text(f"{{based_on: fast, {section}: {{{name}: absent.npz}}}}")
+    assert main([command, "ada", "--preset", "mine.yaml"]) == 2
+    why = "no such file; correct the path, or leave it out"
+    assert capsys.readouterr().err == f"hnerf: {key}: absent.npz: {why}\n"
+    assert not Path("store").exists()
+
+
 def test_check_cameras_prints_every_camera_and_the_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,13 +35,20 @@ def test_an_error_of_input_or_output_while_the_recording_is_read_is_retried(
 
 
 @pytest.mark.parametrize(("module", "study"), STUDIES)
-def test_a_preset_that_leaves_a_camera_out_is_refused(
-    module: ModuleType, study: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ("evaluation: {holdout: each}", r"evaluation\.holdout: only `hnerf run` leaves cameras out; remove it"),
+        ("segmentation: {model: /no/a.onnx}", r"segmentation\.model: /no/a\.onnx: no such file; correct the path, or"),
+    ],
+)
+def test_a_preset_that_no_study_can_use_is_refused_at_once(
+    module: ModuleType, study: Any, settings: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No study would train without the camera, and all figures could be null."""
     monkeypatch.setattr(module, "read_capture", Mock(side_effect=AssertionError))
     preset = tmp_path / "mine.yaml"
-    preset.write_text("based_on: fast\nevaluation: {holdout: each}\n")
-    chosen: dict[str, Any] = {"preset": str(preset)} if module is ablations else {"methods": [str(preset)]}
-    with pytest.raises(InputError, match=r"^evaluation\.holdout: only `hnerf run` leaves cameras out; remove it$"):
+    preset.write_text(f"based_on: fast\n{settings}\n")
+    chosen: dict[str, Any] = {"preset": str(preset)} if module is ablations else {"methods": ["fast", str(preset)]}
+    with pytest.raises(InputError, match=f"^{message}"):
         study.fn(tmp_path, store=tmp_path / "store", **chosen)
