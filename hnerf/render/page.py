@@ -3,6 +3,7 @@
 # To mypy, the values of viser's controls look read-only.
 # mypy: disable-error-code="misc"
 
+import asyncio
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -31,12 +32,13 @@ MOST_CHANGE, CHANGE_STEP = 0.3, 0.01  # of a shape value
 
 def view_subject(subject: Path, motions: Sequence[Path], host: str, port: int) -> None:
     """Show a subject (<store>/subjects/<name>) on a web page until the process is interrupted. motions: files or
-    folders to choose from besides the captured motion. Raises InputError if files or viser are missing, or if the
-    method cannot show other motions. If the port is taken, viser takes the next one."""
+    folders to choose from besides the captured motion. Raises InputError if files or viser are missing, if the method
+    cannot show other motions, or if `host` is another machine's. If the port is taken, viser takes the next one."""
     try:
         import viser
     except ImportError:
         raise InputError("viser is missing; pip install --constraint constraints.txt -e '.[view]'") from None
+    asyncio.run(_check_host(host))
     capture = checked_capture(subject, RenderOptions())
     person = live_person(subject, motions, capture)
     server = viser.ViserServer(host, port, verbose=False)  # prints its address
@@ -45,6 +47,15 @@ def view_subject(subject: Path, motions: Sequence[Path], host: str, port: int) -
         threading.Event().wait()
     finally:
         page.close()
+
+
+async def _check_host(host: str) -> None:
+    """Raise InputError unless a server can listen at this address. Viser would take the failure for a port that is
+    taken, and try others for ever."""
+    try:
+        (await asyncio.start_server(lambda *_: None, host, 0)).close()
+    except (OSError, UnicodeError):  # UnicodeError: no host has such a name
+        raise InputError(f"--host {host}: not an address of this machine; give one, or 0.0.0.0 for all") from None
 
 
 def live_person(subject: Path, motions: Sequence[Path], capture: Capture) -> LivePerson:

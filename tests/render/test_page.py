@@ -154,6 +154,26 @@ def test_two_motions_of_the_same_name_are_refused(subject: Path) -> None:
         live_person(subject, [subject, subject], checked_capture(subject, RenderOptions()))
 
 
+@pytest.mark.parametrize("host", ["192.0.2.1", "x" * 64])
+def test_an_address_of_another_machine_is_refused(
+    host: str, subject: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first is reserved for documentation (RFC 5737); the second is too long for a name."""
+    viser = pytest.importorskip("viser")
+    monkeypatch.setattr(viser, "ViserServer", lambda *_, **__: pytest.fail("would try one port after another"))
+    assert main(["view", str(subject), "--host", host]) == 2
+    why = "not an address of this machine; give one, or 0.0.0.0 for all"
+    assert capsys.readouterr().err == f"hnerf: --host {host}: {why}\n"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "0.0.0.0"])
+def test_an_address_of_this_machine_is_accepted(host: str, subject: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    viser = pytest.importorskip("viser")
+    monkeypatch.setattr(viser, "ViserServer", lambda *given, **_: pytest.fail(f"served at {given[0]}"))
+    with pytest.raises(pytest.fail.Exception, match=f"^served at {host}$"):
+        main(["view", str(subject), "--host", host])
+
+
 def quaternion_of(rotation: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
