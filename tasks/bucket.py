@@ -76,6 +76,8 @@ class Bucket:
         except Exception as error:  # of a file system that connects at once
             raise BucketError(f"{url}: {one_line(error)}; can the bucket be reached?") from error
         bucket = Bucket(fs, root.rstrip("/"))
+        if not (bucket.is_disk or urlsplit(url).netloc):  # as of s3://$BUCKET/captures, if that variable is not set
+            raise InputError(f"{url}: names no bucket; give a URL like s3://bucket/folder")
         # A path that begins with a bucket's name is in an object store, where folders need not exist.
         top = bucket.root if bucket.root.startswith("/") else bucket.root.split("/")[0]
         with bucket._answering(""):

@@ -57,6 +57,8 @@ from tests.shared_data import shared_capture
             "run http://example.com/x.mp4",
             "hnerf: http://example.com/x.mp4: is no bucket; download it and give the file",
         ),
+        ("run s3://", "hnerf: s3://: names no bucket; give a URL like s3://bucket/folder"),
+        ("run s3:///captures/ada", "hnerf: s3:///captures/ada: names no bucket; give a URL like"),
         ("run absent --preset best", "best: no such preset or file; there are "),
         ("run absent --set steps=1", "steps: no such key; it belongs in another section"),
         ("run absent --set training.stepz=1", "training.stepz: no such key; did you mean steps?"),
