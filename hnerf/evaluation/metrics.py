@@ -56,6 +56,7 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 def mask_iou(coverage: np.ndarray, mask: np.ndarray) -> float:
     """Return the intersection over union of a mask (H, W) bool and the pixels that a rendering covers, (H, W) uint8, by
-    more than a half."""
+    more than a half; 1 if there are none of either."""
     covered = coverage > COVERED_LEVEL
-    return float((covered & mask).sum() / (covered | mask).sum())
+    union = (covered | mask).sum()
+    return float((covered & mask).sum() / union) if union else 1.0

@@ -30,11 +30,11 @@ WHOLE = (slice(120, 270), slice(250, 400))  # rows and columns of the mask: 150 
 class GreyField(StandInAvatar):
     """A field that renders the same grey at every pixel."""
 
-    level = 90
+    level, alpha = 90, 1.0
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         shape = camera.height_px, camera.width_px
-        return Rendering(torch.full((*shape, 3), self.level / 255), torch.ones(shape), torch.ones(shape))
+        return Rendering(torch.full((*shape, 3), self.level / 255), torch.full(shape, self.alpha), torch.ones(shape))
 
 
 @pytest.fixture
@@ -138,6 +138,17 @@ def test_a_person_cut_to_a_narrow_strip_is_scored(
     masks = Masks({("01", 4): encode(edge)}, {})
     (found,) = compare_with_field(recorded, masks, GreyField(bending_body()), grey(staged, 100))
     assert min(found.photograph.shape[:2]) >= 11 and np.isfinite(found.scores["asset"]["ssim"])
+
+
+def test_a_mask_of_specks_that_vanish_when_it_is_shrunk_has_finite_scores(
+    recorded: Capture, staged: StagedAvatar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The box is wider than LONGEST_PX, and nothing is rendered in it."""
+    specks = np.zeros((480, 640), bool)
+    specks[[0, 40], [0, 639]] = True
+    monkeypatch.setattr(GreyField, "alpha", 0.0)
+    (found,) = compare_with_field(recorded, Masks({("01", 4): encode(specks)}, {}), GreyField(bending_body()), staged)
+    assert found.scores["field"]["mask_iou"] == 1.0 and np.isfinite(found.scores["asset"]["mask_iou"])
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,12 @@ def test_mask_iou_counts_pixels_with_more_than_half_coverage() -> None:
     assert mask_iou(coverage, mask) == pytest.approx(2 / 4)
 
 
+def test_the_mask_iou_of_nobody_and_nothing_is_one() -> None:
+    """Results may not hold NaN."""
+    nobody = np.zeros((2, 4), bool)
+    assert mask_iou(np.zeros((2, 4), np.uint8), nobody) == 1.0 and mask_iou(np.full((2, 4), 255), nobody) == 0.0
+
+
 def test_mask_iou_uses_coverage_not_brightness() -> None:
     """A head has 4 pixels, of which the upper two are black hair in image and rendering. By brightness, they would be
     missed."""
