@@ -294,9 +294,9 @@ def _decoded(path: Path, mode: int) -> np.ndarray | None:
     return cv2.imdecode(content, mode) if len(content) else None
 
 
-def to_8_bit(values: np.ndarray) -> np.ndarray:
-    """Convert values in [0, 1] to uint8; values beyond are clipped."""
-    return (255 * values).round().clip(0, 255).astype(np.uint8)
+def to_8_bit(levels: np.ndarray) -> np.ndarray:
+    """Round levels of 255 to uint8; levels beyond are clipped."""
+    return levels.round().clip(0, 255).astype(np.uint8)
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:

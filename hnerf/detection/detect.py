@@ -154,7 +154,7 @@ def find_in_camera(capture: Capture, camera: str, settings: DetectionSettings, o
             own.append(np.array([network(image, person) for person in people]).reshape(-1, network.points, 3))
         write_image(out / PERSON / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))
         mask_rows.append(len(masks))
-        masks += [to_8_bit(person.mask) for person in people] if len(people) > 1 else []
+        masks += [to_8_bit(255 * person.mask) for person in people] if len(people) > 1 else []
         everybody.append([person._replace(mask=np.zeros(0)) for person in people])
     path = out / LANDMARKS / f"{camera}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -187,7 +187,7 @@ def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarra
     likely = np.zeros(size_px[::-1], np.float32)
     for person in people:
         likely = np.maximum(likely, person.region.paste(person.mask, size_px))
-    return to_8_bit(likely)
+    return to_8_bit(255 * likely)
 
 
 def _is_whole(path: Path) -> bool:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hnerf.capture.capture import to_8_bit
 from hnerf.segmentation.prior import Prior
 
 LOG_OFFSET = 6.0  # grey levels added before the logarithm: below them sensors and JPEG carry little information
@@ -57,7 +58,7 @@ def exposure_corrected(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -
     gains = np.median((_some(image, free) + LOG_OFFSET) / (_some(plate, free) + LOG_OFFSET), 0)
     if np.abs(gains - 1).max() < MIN_GAIN:
         return plate
-    return ((plate + LOG_OFFSET) * gains - LOG_OFFSET).round().clip(0, 255).astype(np.uint8)
+    return to_8_bit((plate + LOG_OFFSET) * gains - LOG_OFFSET)
 
 
 def noise_level(image: np.ndarray, plate: np.ndarray, free: np.ndarray) -> float:
@@ -96,8 +97,7 @@ def difference(image: np.ndarray, plate: np.ndarray, noise: float, shadowed: boo
     background = np.logaddexp(np.log(1 - share) + unchanged, np.log(share) + shadow)
     person = _log_gaussian(3 * brightness**2, 3 * PERSON_BRIGHTNESS**2, 1) + _log_gaussian(chroma, tones, 2)
     contrast = CONTRAST_GAIN * (image.astype(np.float32) - plate) / np.sqrt(plate + CONTRAST_FLOOR)
-    picture = (128 + contrast).clip(0, 255).round().astype(np.uint8)
-    return Difference((person - background).astype(np.float32), picture, plate)
+    return Difference((person - background).astype(np.float32), to_8_bit(128 + contrast), plate)
 
 
 def _log_gaussian(squared: np.ndarray, variance: np.ndarray | float, dimensions: int) -> np.ndarray:

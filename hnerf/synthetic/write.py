@@ -70,7 +70,7 @@ def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
     test_cameras = camera_names(settings)[1]
     views = {camera.name: RoomView.of(camera) for camera in ring_of_cameras(settings)}
     for name, view in views.items():
-        write_image(out / "background" / f"{name}.jpg", to_8_bit(view.plate))
+        write_image(out / "background" / f"{name}.jpg", to_8_bit(255 * view.plate))
     write_easymocap(out, [pinhole(view.camera) for view in views.values()])
     _write_toml(out, settings)
 
@@ -152,10 +152,10 @@ def _write_view(
     on_black, coverage, mask = render_person(truth.person, camera)
     photograph = on_black + (1 - coverage[..., None]) * view.shadowed(truth.shadow, truth.ground_m)
     noise = rng.normal(0, SENSOR_NOISE / 255, photograph.shape)
-    write_image(out / "images" / camera.name / f"{frame:06d}.jpg", to_8_bit(photograph + noise))
+    write_image(out / "images" / camera.name / f"{frame:06d}.jpg", to_8_bit(255 * (photograph + noise)))
     write_image(out / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", 255 * mask.astype(np.uint8))
     if scored:
-        write_image(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", to_8_bit(on_black))
+        write_image(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", to_8_bit(255 * on_black))
     detected = detect(truth.keypoints_m, camera, truth.person.mesh, rng)
     write_openpose(out / "openpose" / camera.name / f"{frame:06d}_keypoints.json", detected.round(3))
 

@@ -16,7 +16,7 @@ from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.board_footage import BOARDS_FILE
 from hnerf.capture.body_25 import Body25
-from hnerf.capture.capture import PERSON, Capture, write_image
+from hnerf.capture.capture import PERSON, Capture, to_8_bit, write_image
 from hnerf.capture.subset import copy_files, write_arrays
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
 from hnerf.geometry.rays import RayHits, cast, mesh_on_cpu
@@ -181,7 +181,7 @@ def _draw(lit_garment: LitGarment, capture: Capture, truth: GroundTruth, camera:
     rgb, coverage, mask = render_person(lit_garment, capture.cameras[camera])
 
     def over(pixels: np.ndarray) -> np.ndarray:
-        return (255 * rgb + (1 - coverage[..., None]) * pixels).round().clip(0, 255).astype(np.uint8)
+        return to_8_bit(255 * rgb + (1 - coverage[..., None]) * pixels)
 
     def joined(person: np.ndarray) -> np.ndarray:
         return np.where(person | mask, 255, 0).astype(np.uint8)

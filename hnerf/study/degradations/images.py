@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.board_footage import BOARDS_FILE
-from hnerf.capture.capture import PERSON, Capture, write_image
+from hnerf.capture.capture import PERSON, Capture, to_8_bit, write_image
 from hnerf.capture.subset import PointChange, copy_pixels, require_several_cameras, subject_point, write_arrays
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]
@@ -20,7 +20,7 @@ PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
 def add_noise(capture: Capture, levels: float, rng: np.random.Generator, out: Path) -> None:
     """Add independent Gaussian noise to every image. levels: its standard deviation, in levels of 255."""
-    rewrite_images(capture, out, lambda _, rgb: _to_8_bit(rgb + rng.normal(0, levels, rgb.shape)))
+    rewrite_images(capture, out, lambda _, rgb: to_8_bit(rgb + rng.normal(0, levels, rgb.shape)))
 
 
 def blur(capture: Capture, percent: float, rng: np.random.Generator, out: Path) -> None:
@@ -34,7 +34,7 @@ def vary_exposure(capture: Capture, power: float, rng: np.random.Generator, out:
     require_several_cameras(capture)
     names = rng.permutation(capture.train_cameras)
     gains = dict(zip(names.tolist(), 2 ** np.linspace(-power, power, len(names)), strict=True))
-    rewrite_images(capture, out, lambda camera, rgb: _to_8_bit(rgb * gains[camera]))
+    rewrite_images(capture, out, lambda camera, rgb: to_8_bit(rgb * gains[camera]))
 
 
 def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) -> None:
@@ -81,12 +81,8 @@ def rewrite_images(
                 grey = change_mask(name, np.where(mask, 255, 0).astype(np.uint8))
                 write_image(out / "masks" / name / f"{frame:06d}.png", np.where(grey > 127, 255, 0).astype(np.uint8))
             if likely is not None:
-                write_image(out / PERSON / name / f"{frame:06d}.png", change_mask(name, _to_8_bit(255 * likely)))
+                write_image(out / PERSON / name / f"{frame:06d}.png", change_mask(name, to_8_bit(255 * likely)))
         plate = capture.background(name)
         if plate is not None:
             write_image(out / "background" / f"{name}.jpg", change(name, plate))
     kept.save()
-
-
-def _to_8_bit(pixels: np.ndarray) -> np.ndarray:
-    return pixels.round().clip(0, 255).astype(np.uint8)
