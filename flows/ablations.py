@@ -22,7 +22,6 @@ from hnerf.files import replace_text
 from hnerf.study.benchmark import results
 from hnerf.tables import pick, table
 from tasks.evaluation import evaluate
-from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
 from tasks.source import Source, read_capture
 from tasks.stage import retried
@@ -59,7 +58,6 @@ def ablate(
         only: Names of ablations, all if empty; the table's name then ends in "-part".
     """
     rows, left_out = choose(load_settings(preset, overrides), only)
-    set_limits(rows[FULL].limits)
     artifact_store = Store(store.resolve())
     source, truth = retried(read_capture)(capture, store)
     subject = Capture.load(ingest_recording(artifact_store, source, rows[FULL]).root).name

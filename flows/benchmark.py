@@ -21,7 +21,6 @@ from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
 from hnerf.study.benchmark.publish import publish, table_path
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated_capture
-from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
 from tasks.source import GROUND_TRUTH, Source, read_capture
 from tasks.stage import retried
@@ -57,7 +56,6 @@ def benchmark(
     plan = whole.restricted_to(methods or [], seconds)
     presets = [plan.settings(name) for name in plan.methods]  # invalid presets are refused first
     check_presets(presets)
-    set_limits(presets[0].limits)
     artifact_store = Store(store.resolve())
     source, truth = retried(read_capture)(capture, store)
     recorded = Capture.load(ingest_recording(artifact_store, source, presets[0]).root)

@@ -71,12 +71,10 @@ def check_cameras(options: argparse.Namespace) -> None:
     from flows.preparation import ingest_recording, with_detections
     from hnerf.capture.capture import Capture
     from tasks.calibration import calibrate
-    from tasks.limits import set_limits
     from tasks.source import read_capture
     from tasks.store import Store
 
     settings, store = load_settings(options.preset), Store(options.store.resolve())
-    set_limits(settings.limits)
     source, _ = read_capture(options.capture, options.store)
     recording = with_detections(store, ingest_recording(store, source, settings), settings)
     calibration = calibrate(store, recording, settings.calibration)

@@ -49,7 +49,9 @@ def missing_cameras(store: Store, source: Source) -> Artifact | None:
 
 
 def ingest_recording(store: Store, source: Source, settings: Settings) -> Artifact:
-    """Ingest a recording, with cameras found from the person if it has none."""
+    """Ingest a recording, with cameras found from the person if it has none. The limits of these settings apply here
+    and afterwards."""
+    set_limits(settings.limits)
     return ingest(store, source, settings.capture, missing_cameras(store, source))
 
 
@@ -63,9 +65,7 @@ def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Art
 
 
 def ingest_part(store: Store, source: Source, part: CapturePart, settings: Settings) -> Artifact:
-    """Ingest the recording, or the part of it that a study uses. The limits of these settings apply here and
-    afterwards."""
-    set_limits(settings.limits)
+    """Ingest the recording, or the part of it that a study uses."""
     recording = with_detections(store, ingest_recording(store, source, settings), settings)
     parts = part.select(Capture.load(recording.root))
     return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)

@@ -16,7 +16,6 @@ from flows.stability import stability
 from hnerf.errors import InputError, NotApplicableError, PlaceError
 from hnerf.study.stability.charts import curve_chart, matrix_chart
 from tasks.launcher import LostWorkerError
-from tasks.limits import current_limits
 
 pytestmark = pytest.mark.usefixtures("stages")
 
@@ -140,14 +139,6 @@ def study(tmp_path: Path, **options: Any) -> dict[str, Any]:
     part = "-part" if options else ""
     assert table == tmp_path / "store" / "stability" / f"ada-mine{part}.md"
     return dict(json.loads(table.with_suffix(".json").read_text()))
-
-
-def test_the_recording_is_read_within_the_limits_of_the_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "large.yaml").write_text("based_on: fast\nlimits: {reader_gib: 64}")
-    (tmp_path / "mine.yaml").write_text(STUDY)
-    monkeypatch.setattr(preparation, "ingest", lambda *_: pytest.fail(f"{current_limits().reader_gib:g} GiB"))
-    with pytest.raises(pytest.fail.Exception, match=r"^64 GiB"):
-        stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", [str(tmp_path / "large.yaml")])
 
 
 @pytest.mark.usefixtures("true_charts")
