@@ -52,9 +52,9 @@ class StagedAvatar:
     extents_m: dict[str, np.ndarray]
     texture: np.ndarray
     stage_from_world: np.ndarray
-    albedo: Albedo | None = None
-    normal_map: np.ndarray | None = None
-    joint_names: JointNames = OWN
+    albedo: Albedo | None
+    normal_map: np.ndarray | None
+    joint_names: JointNames
 
     @property
     def rates(self) -> tuple[int, ...]:

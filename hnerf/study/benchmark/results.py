@@ -95,7 +95,7 @@ def smallest_timed_px(result: Mapping[str, Any]) -> str:
     return min((size for variant in result["variants"].values() for size in _sizes(variant)), key=int)
 
 
-def sweep_curves(result: Mapping[str, Any], key: str = "psnr") -> dict[str, list[Point]]:
+def sweep_curves(result: Mapping[str, Any], key: str) -> dict[str, list[Point]]:
     """Return, by method, a score of the finished model over the number of cameras or frames, in ascending order; the
     mean of variants that calibration left with the same number."""
     curves: dict[str, dict[int, list[float]]] = {}

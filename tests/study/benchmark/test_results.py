@@ -189,9 +189,9 @@ def test_cameras_that_calibration_left_out_are_noted_and_not_plotted() -> None:
     of_three["variants"]["4 cameras"]["methods"]["fast"]["trained_on"] = {"cameras": 3, "frames": 1}
     text = as_markdown(of_three, [], [])
     assert "- fast: trained on 3 cameras and 1 frames: calibration left the others out" in text
-    assert sweep_curves(of_three)["fast"] == [(2, 28.0), (3, 30.0)]
+    assert sweep_curves(of_three, "psnr")["fast"] == [(2, 28.0), (3, 30.0)]
     of_three["variants"]["2 cameras"]["methods"]["fast"]["trained_on"] = {"cameras": 3, "frames": 1}
-    assert sweep_curves(of_three)["fast"] == [(3, 29.0)]
+    assert sweep_curves(of_three, "psnr")["fast"] == [(3, 29.0)]
 
 
 def test_a_method_without_a_scored_image_has_no_curve_and_does_not_change_the_counts() -> None:
@@ -223,7 +223,7 @@ def test_data_of_charts_by_hand() -> None:
     assert heading("4 cameras", variants["4 cameras"]) == "4 cameras, new views"
     assert smallest_timed_px(result()) == "256"
     assert frame_points(variants["4 cameras"]) == {"fast": (0.5, 30.0), "nerf": (2.0, 26.0)}
-    assert sweep_curves(result()) == {"fast": [(2, 28.0), (4, 30.0)], "nerf": [(4, 26.0)]}
+    assert sweep_curves(result(), "psnr") == {"fast": [(2, 28.0), (4, 30.0)], "nerf": [(4, 26.0)]}
     assert scatter_points(variants["2 cameras"], "novel_view", "view_angle_deg") == {
         "fast": [(40.0, 28.0), (42.0, 30.0)]
     }
