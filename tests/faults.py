@@ -562,6 +562,10 @@ FAULTS = (
           "for c in self.capture.cameras for", seen_by="evaluation/evaluate"),
     Fault("bvh-root", "asset/bvh_file", "    offsets[0] = 0", "    offsets[0] = offsets[0]"),
     Fault("garbage-damaged", "tasks/garbage", "record in lost or not", "not"),
+    Fault("preset-empty", "config", "if not tree:", "if False:"),
+    Fault("named-files", "config", "isinstance(value, Path) and not value.is_file()", "False"),
+    Fault("view-elsewhere", "render/page", "    asyncio.run(_check_host(host))\n", ""),
+    Fault("iou-of-nobody", "evaluation/metrics", " if union else 1.0", ""),
 )  # fmt: skip
 
 

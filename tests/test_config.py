@@ -8,7 +8,17 @@ import torch
 from pydantic import ValidationError
 
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
-from hnerf.config import NerfSettings, Settings, SyntheticSettings, load_settings, title_of, validated, with_changes
+from hnerf.config import (
+    NerfSettings,
+    Settings,
+    SyntheticSettings,
+    load_settings,
+    overridden,
+    require_named_files,
+    title_of,
+    validated,
+    with_changes,
+)
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import load_study
 from hnerf.study.stability.plan import load_stability
@@ -153,6 +163,15 @@ def test_a_preset_builds_on_another(tmp_path: Path) -> None:
     path.write_text("based_on: absent")
     with pytest.raises(InputError, match=r"^absent: no such preset or file"):
         load_settings(str(path))
+
+
+def test_files_that_settings_name_must_be_there(tmp_path: Path) -> None:
+    """The body model `anny` is no file."""
+    (tmp_path / "seg.onnx").touch()
+    settings = load_settings("fast", [f"segmentation.model={tmp_path}/seg.onnx"])
+    require_named_files(settings)
+    with pytest.raises(InputError, match=r"^fit\.body_model: anni: no such file; correct the path, or leave it out$"):
+        require_named_files(overridden(settings, ["fit.body_model=anni"]))
 
 
 @pytest.mark.parametrize("content", [b"", b"# training: {steps: 7}", b"\xff\xfe", b"{}"])
