@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hnerf.avatar.avatar import Gains
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, to_8_bit
 from hnerf.capture.masks import Masks
 from hnerf.geometry.reach import ReachablePixels
 from hnerf.segmentation.edge import shaded_plate
@@ -110,7 +110,7 @@ def _write_pixels(
             if plates and wanted.any():
                 window = bounding_window(wanted)
                 shaded = shaded_plate(mask[window], image[window], plates[c].colour[window])[wanted[window]]
-                columns.append("plate", _exposure_corrected(shaded.clip(0, 255).round().astype(np.uint8), gain))
+                columns.append("plate", _exposure_corrected(to_8_bit(shaded), gain))
         columns.close("starts", columns.ends["image_starts"] - columns.ends["starts"])
 
 
@@ -136,7 +136,7 @@ class _Columns:
 
 def _exposure_corrected(shown: np.ndarray, gain: tuple[float, float, float] | None) -> np.ndarray:
     """Return colours (P, 3) uint8 as a camera of gain 1 would show them."""
-    return shown if gain is None else (shown / np.array(gain, np.float32)).round().clip(0, 255).astype(np.uint8)
+    return shown if gain is None else to_8_bit(shown / np.array(gain, np.float32))
 
 
 def _mapped(path: Path, kind: torch.dtype, width: int) -> Tensor | None:
