@@ -9,6 +9,7 @@ from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas import filters
 from prefect.client.schemas.objects import FlowRun, State, StateType
 from prefect.client.schemas.sorting import FlowRunSort
+from prefect.events.filters import EventFilter, EventNameFilter, EventOccurredFilter, EventResourceFilter
 from prefect.states import Failed, Scheduled
 
 FLOW, NAME = "train-subject", "local"
@@ -19,6 +20,10 @@ AGAIN = "crashed; begun again"
 # A worker with a limit ends if it is offered a run that it has not released yet. Before it releases one, it imports the
 # flow once more, for its hooks, which takes a minute on a busy machine.
 RELEASE = timedelta(minutes=2)
+# Two heartbeats (prefect.toml), and what they take to arrive. A server that was away for longer than the automation's
+# silence takes living runs for lost before they can reach it.
+QUIET = timedelta(seconds=75)
+HEARTBEAT = "prefect.flow-run.heartbeat"
 PAGE = 100  # runs per request; the server returns at most 200
 
 log = logging.getLogger("hnerf.restart")
@@ -33,10 +38,16 @@ def unfinished_runs() -> int:
 def restart_crashed(max_restarts: int) -> list[tuple[FlowRun, str]]:
     """Put crashed runs of the deployment, whose machine or process was lost, back into the queue, to start after
     RELEASE. Each is restarted at most `max_restarts` times, because the run itself may be what ends the process, even
-    before the server counts it as running. Runs that crash once more become failed; return these, with the reason."""
+    before the server counts it as running. Runs that crash once more become failed; return these, with the reason.
+
+    A run whose process may live is left alone until it has been silent for QUIET. It stays Crashed, which it can leave
+    by completing: set back to Running, it would in the end release a slot that it no longer holds."""
     given_up = []
     with get_client(sync_client=True) as client:
         for run in _all_runs(client, StateType.CRASHED):
+            if datetime.now(UTC) - _last_sign(client, run) < QUIET:
+                log.info("%s crashed, and its process may live: it is not begun again yet", run.name)
+                continue
             before = [state.message == AGAIN for state in client.read_flow_run_states(run.id)].count(True)
             if before < max_restarts:
                 again: State[None] = Scheduled(scheduled_time=datetime.now(UTC) + RELEASE, message=AGAIN)
@@ -49,6 +60,19 @@ def restart_crashed(max_restarts: int) -> list[tuple[FlowRun, str]]:
                 log.error("%s failed: %s", run.name, lost)
                 given_up.append((run, lost))
     return given_up
+
+
+def _last_sign(client: SyncPrefectClient, run: FlowRun) -> datetime:
+    """Return when the server received the run's latest heartbeat, or ended the run, whichever was later."""
+    assert run.state is not None
+    heartbeats = EventFilter(
+        event=EventNameFilter(name=[HEARTBEAT]),
+        resource=EventResourceFilter(id=[f"prefect.flow-run.{run.id}"]),
+        # By the clock of the run's machine, which may be fast.
+        occurred=EventOccurredFilter(until=datetime.now(UTC) + timedelta(days=1)),  # type: ignore[arg-type]
+    )
+    received = [event.received for event in client.read_events(heartbeats, limit=1).events]
+    return max([run.state.timestamp, *received])
 
 
 def _all_runs(client: SyncPrefectClient, *states: StateType) -> list[FlowRun]:

@@ -1,7 +1,7 @@
 import contextlib
 import json
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ from prefect.client.schemas.actions import WorkPoolCreate
 from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName, FlowFilter, FlowFilterName
 from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.deployments import run_deployment
+from prefect.events import emit_event
 from prefect.exceptions import PrefectHTTPStatusError
-from prefect.states import Crashed
+from prefect.states import Completed, Crashed
 from prefect.testing.cli import invoke_and_assert
 
 from flows import restart
@@ -90,7 +91,8 @@ def test_values_out_of_range_are_refused_before_a_run_is_created(wrong: dict[str
         run_deployment("ingest-captures/local", parameters={"folder": "captures", **wrong}, timeout=0)
 
 
-def test_a_crashed_run_is_restarted_a_few_times_and_then_fails(deployed: str) -> None:
+def test_a_crashed_run_is_restarted_a_few_times_and_then_fails(deployed: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(restart, "QUIET", timedelta(0))
     run = run_deployment("train-subject/local", parameters={"capture": "/recordings/bob"}, timeout=0)
     with get_client(sync_client=True) as client:
         for _ in range(2):
@@ -104,6 +106,28 @@ def test_a_crashed_run_is_restarted_a_few_times_and_then_fails(deployed: str) ->
         assert lost.id == run.id and state and (state.name, state.message) == ("Failed", why)  # type: ignore[union-attr]
         assert why.startswith("its process or machine was lost 3 times")
         assert restart_crashed(max_restarts=2) == []
+
+
+def test_a_run_that_may_live_is_not_started_a_second_time(deployed: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that was away ends all runs when it returns, before their heartbeats reach it. Such a run can still
+    complete."""
+    run = run_deployment("train-subject/local", parameters={"capture": "/recordings/eve"}, timeout=0).id  # type: ignore[union-attr]
+    with get_client(sync_client=True) as client:
+        client.set_flow_run_state(run, Crashed(), force=True)
+        crashed = client.read_flow_run(run)
+        ended = restart._last_sign(client, crashed)
+        emit_event(restart.HEARTBEAT, resource={"prefect.resource.id": f"prefect.flow-run.{run}"})
+        deadline = time.monotonic() + PATIENCE_S
+        while (alive := restart._last_sign(client, crashed)) == ended and time.monotonic() < deadline:
+            time.sleep(0.5)
+        assert crashed.state and ended == crashed.state.timestamp < alive
+        for quiet, state in ((restart.QUIET, "Crashed"), (timedelta(0), "Scheduled")):
+            monkeypatch.setattr(restart, "QUIET", quiet)
+            assert restart_crashed(max_restarts=2) == []
+            assert client.read_flow_run(run).state_name == state
+        client.set_flow_run_state(run, Crashed(), force=True)
+        client.set_flow_run_state(run, Completed())
+        assert client.read_flow_run(run).state_name == "Completed"
 
 
 def test_runs_beyond_one_page_of_the_server_are_counted(deployed: str, monkeypatch: pytest.MonkeyPatch) -> None:
