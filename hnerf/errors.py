@@ -40,6 +40,12 @@ def raise_if_unreachable(error: Exception) -> None:
         raise error
 
 
+def is_out_of_memory(error: object) -> bool:
+    """Return whether this machine or its GPU had no memory left. PyTorch's errors are known by their message: naming
+    their classes would import it, and a GPU without memory for a first process raises another class."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "out of memory" in str(error))
+
+
 def printable(text: str) -> str:
     """Return text as one line of bounded length that cannot control a terminal: line breaks become spaces, other
     control characters are escaped."""

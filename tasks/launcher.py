@@ -31,7 +31,7 @@ KILLED = (signal.SIGKILL, signal.SIGTERM)
 
 
 class LostWorkerError(RuntimeError):
-    """A rank or torchrun was killed from outside (out of memory, a lost machine); the work can be retried."""
+    """A rank or torchrun got no memory or was killed from outside; the work can be retried."""
 
 
 class RankFailedError(RuntimeError):
@@ -45,7 +45,12 @@ def _os_error(message: str) -> OSError:
 
 
 # Exceptions by exit code of ranks that print the reason in one line on stderr; libraries may print more at exit.
-ERROR_BY_EXIT_CODE: dict[int, Callable[[str], Exception]] = {2: InputError, 3: RankFailedError, 4: _os_error}
+ERROR_BY_EXIT_CODE: dict[int, Callable[[str], Exception]] = {
+    2: InputError,
+    3: RankFailedError,
+    4: _os_error,
+    5: LostWorkerError,
+}
 
 
 def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:

@@ -16,7 +16,7 @@ from prefect.settings import PREFECT_RESULTS_LOCAL_STORAGE_PATH
 from prefect.tasks import Task
 
 from hnerf.config import Section
-from hnerf.errors import PlaceError
+from hnerf.errors import PlaceError, is_out_of_memory
 from tasks.bucket import VARIABLE
 from tasks.launcher import LostWorkerError
 from tasks.limits import StalledError
@@ -98,16 +98,18 @@ def is_transient(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
 
 
 def is_retryable(error: object) -> bool:
-    """Return whether a retry may succeed: only after failed input or output, timeouts and lost workers, or if a stalled
-    stage would continue from a checkpoint."""
+    """Return whether a retry may succeed: only after failed input or output, timeouts, lack of memory and lost workers,
+    or if a stalled stage would continue from a checkpoint."""
     if isinstance(error, StalledError):
         return error.retryable
+    if is_out_of_memory(error):
+        return True
     return isinstance(error, OSError | LostWorkerError) and not is_permanent(error)
 
 
 def is_of_the_machine(error: Exception) -> bool:
-    """Return whether an error comes from the machine and is no result of a study: a full disk, a killed worker, or a
-    store or bucket that cannot be reached."""
+    """Return whether an error comes from the machine and is no result of a study: a full disk or GPU, a killed
+    worker, or a store or bucket that cannot be reached."""
     return isinstance(error, PlaceError) or is_retryable(error)
 
 

@@ -488,6 +488,8 @@ FAULTS = (
           "angle_deg.amin(0).sum()"),
     # retries, resumed work and cached results
     Fault("retry-lost-worker", "tasks/policy", "OSError | LostWorkerError)", "OSError)"),
+    Fault("retry-out-of-memory", "tasks/policy", "if is_out_of_memory(error):", "if False:"),
+    Fault("rank-out-of-memory", "tasks/launcher", "    5: LostWorkerError,\n", ""),
     Fault("retry-permanent", "tasks/policy", " and not is_permanent(error)", ""),
     Fault("key-ignores-version", "tasks/policy", '"version": version, ', ""),
     Fault("store-lock-link", "tasks/store", "flags | os.O_NOFOLLOW", "flags"),

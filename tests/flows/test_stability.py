@@ -8,6 +8,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import torch
 
 from flows import preparation, run_page
 from flows import stability as module
@@ -287,7 +288,12 @@ def test_bad_input_in_evaluation_has_the_verdict_failed(tmp_path: Path, monkeypa
 
 @pytest.mark.parametrize(
     "error",
-    [LostWorkerError("rank 0 was killed"), OSError(28, "No space left on device"), PlaceError("s3://b: closed")],
+    [
+        LostWorkerError("rank 0 was killed"),
+        OSError(28, "No space left on device"),
+        PlaceError("s3://b: closed"),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB."),
+    ],
 )
 def test_errors_of_the_machine_end_the_command_and_finished_runs_are_kept(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

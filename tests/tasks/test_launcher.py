@@ -104,6 +104,7 @@ def test_a_failing_rank_ends_all_ranks_with_its_message(
             OSError,
             r"^\[Errno 28\] No space left on device: 'b\.pt'$",
         ),
+        (5, "hnerf: CUDA out of memory; end what", LostWorkerError, "^CUDA out of memory; end what$"),
         (-signal.SIGTERM, "stopped", LostWorkerError, "^ranks: rank 1 was killed by SIGTERM$"),
         (-signal.SIGSEGV, "oh", RuntimeError, "^ranks: rank 1 crashed with SIGSEGV\na warning\noh$"),
     ],

@@ -4,6 +4,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import torch
 from prefect.states import Failed
 
 from hnerf.config import (
@@ -137,6 +138,10 @@ def test_key_equals_a_known_value() -> None:
         (TimeoutError("server"), True),
         (ConnectionResetError("peer"), True),
         (LostWorkerError("rank 1 was killed"), True),
+        (MemoryError(), True),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB."), True),
+        (RuntimeError("CUDA error: out of memory"), True),
+        (RuntimeError("bug"), False),
         (FileNotFoundError("a.jpg"), False),
         (PermissionError("a.jpg"), False),
         (IsADirectoryError("a.jpg"), False),
