@@ -21,7 +21,7 @@ from hnerf.config import load_settings
 from hnerf.errors import InputError
 from hnerf.files import now_s
 from tasks import quarantine
-from tasks.bucket import is_visible
+from tasks.bucket import Bucket, is_visible
 from tasks.ledger import Ledger
 from tasks.remote import remote_captures
 from tasks.source import entries, path_or_url, read_capture
@@ -44,8 +44,9 @@ def ingest_captures(
     """Start `train-subject` once for every capture in the subfolders of a folder; return those started now.
 
     The folder is created if it does not exist. A capture is identified by its content: moved, renamed or copied, it is
-    not trained again, unless its run found the folder missing. In a bucket, names, sizes and ETags identify it.
-    `<folder>/.refused/<name>.txt` says why a capture cannot be read (not in a bucket). Crashed runs are queued again.
+    not trained again, unless its run found the folder missing, or failed through its machine's fault. In a bucket,
+    names, sizes and ETags identify it. `<folder>/.refused/<name>.txt` says why a capture cannot be read (not in a
+    bucket). Crashed runs are queued again.
 
     Args:
         folder: The folder to watch, or the URL of one in a bucket. Each subfolder is a capture.
@@ -68,6 +69,7 @@ def ingest_captures(
         capture = path_or_url(lost.parameters["capture"])
         quarantine.note_run(capture, store, f"failed: {why} (flow run {lost.name}, {lost.id})")
     load_settings(preset)  # a misspelled one would use up every capture: failed runs are not started again
+    Bucket.configured()  # likewise a bucket that is not there
     started: list[str] = []
     room: int | None = None
     for capture, listing in _unseen(folder, ledger, settle_s):

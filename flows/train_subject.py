@@ -20,14 +20,14 @@ from hnerf.errors import InputError, one_line
 from hnerf.evaluation.holdout import held_out_cameras
 from hnerf.tables import table
 from tasks.asset import export
-from tasks.bucket import BucketError
 from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
-from tasks.ledger import forget
+from tasks.ledger import forget, release
 from tasks.limits import set_limits
-from tasks.quarantine import clear, note_run
+from tasks.policy import is_of_the_machine
+from tasks.quarantine import MACHINE, clear, note_run
 from tasks.quiet import EXPECTED
 from tasks.remote import fetched, remote_capture
 from tasks.source import GoneError, Source, path_or_url, read_capture
@@ -132,13 +132,18 @@ def ingested(store: Store, source: Source, capture: Path | str, settings: Settin
 
 @train_subject.on_failure
 def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
-    """Write the reason into the watched folder, if the capture was started from there."""
+    """Write the reason into the watched folder, if the capture was started from there. If the machine is to blame,
+    release the capture, so that it may be started again."""
     capture, store = path_or_url(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
     error = state.result(raise_on_failure=False)
     if isinstance(error, Exception):
-        kind = "refused" if isinstance(error, InputError) else "failed"
         why = str(error) if isinstance(error, EXPECTED) else f"{type(error).__name__}: {one_line(error)}"
-        note_run(capture, store, f"{kind}: {why} (flow run {flow_run.name}, {flow_run.id})")
+        why = f"{why} (flow run {flow_run.name}, {flow_run.id})"
+        if is_of_the_machine(error):
+            note_run(capture, store, f"failed: {why}", MACHINE)
+            release(store, capture)
+        else:
+            note_run(capture, store, f"{'refused' if isinstance(error, InputError) else 'failed'}: {why}")
 
 
 @train_subject.on_completion
@@ -151,16 +156,10 @@ def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
 
 
 def local_folder(store: Store, capture: Path | str) -> Path:
-    """Return a capture's folder or video; fetch it if it is in a bucket. If the bucket cannot be reached, release the
-    capture, so that it may be started again."""
+    """Return a capture's folder or video; fetch it if it is in a bucket."""
     if isinstance(capture, Path):
         return capture
-    try:
-        found = retried(remote_capture)(capture)
-    except BucketError:
-        forget(store.root, capture)
-        raise
-    return fetched(store, found)
+    return fetched(store, retried(remote_capture)(capture))
 
 
 def calibrated_held_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:

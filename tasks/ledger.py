@@ -1,20 +1,21 @@
 """The ledger of a watched folder: which captures were started, by their content.
 
 <store>/ingested/<digest>         the folder and the flow run of a capture that was started
-<store>/ingested/<digest>.lost    the flow run that did not find its folder; the capture may be started again
+<store>/ingested/<digest>.lost    the flow run that did not find its folder, or whose machine failed; it may start again
+<store>/ingested/<digest>.failed  the flow runs after which the capture was released because their machine failed
 <store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
 <store>/ingested/new-<listing>    a listing in a bucket that is not started yet; written when it was first seen
 <store>/ingested/id               random, so that the same key in another ledger is another run
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
 
 from hnerf.files import now_s, replace_text
 
-LOST = ".lost"
+LOST, FAILED = ".lost", ".failed"
+RELEASES = 3  # of a capture; the fault may be in every machine, or not in the machine after all
 
 
 @dataclass(frozen=True)
@@ -68,19 +69,33 @@ class Ledger:
 def forget(store: Path, capture: Path | str) -> None:
     """Release the capture that was started from a folder or URL where it no longer is, so that the next look starts it
     from where it is now."""
-    missing = capture if isinstance(capture, str) else str(capture.absolute())
-    for record in list(_records(store)):
-        folder, _, run = record.read_text(errors="replace").partition("\n")
-        if folder == missing:
-            replace_text(record.with_name(f"{record.name}{LOST}"), run.strip())
-            record.unlink()
+    for record, run in _started_from(store, capture):
+        _forget(record, run)
+
+
+def release(store: Path, capture: Path | str) -> None:
+    """Release the capture that was started from a folder or URL and failed through no fault of its own, so that the
+    next look starts it again, at most RELEASES times."""
+    for record, run in _started_from(store, capture):
+        failed = record.with_name(f"{record.name}{FAILED}")
+        runs = failed.read_text(errors="replace").splitlines() if failed.exists() else []
+        if len(runs) < RELEASES:
+            replace_text(failed, "\n".join([*runs, run, ""]))
+            _forget(record, run)
 
 
 def was_started(store: Path, capture: Path) -> bool:
     """Return whether this folder's run was started from the watched folder."""
-    folder = str(capture.absolute())
-    return any(record.read_text(errors="replace").partition("\n")[0] == folder for record in _records(store))
+    return bool(_started_from(store, capture))
 
 
-def _records(store: Path) -> Iterator[Path]:
-    return (store / "ingested").glob("[0-9a-f]" * 64)
+def _started_from(store: Path, capture: Path | str) -> list[tuple[Path, str]]:
+    """Return the records of what was started from a folder or URL, and the flow runs in them."""
+    started = capture if isinstance(capture, str) else str(capture.absolute())
+    records = [(record, record.read_text(errors="replace")) for record in (store / "ingested").glob("[0-9a-f]" * 64)]
+    return [(record, text.partition("\n")[2].strip()) for record, text in records if text.partition("\n")[0] == started]
+
+
+def _forget(record: Path, run: str) -> None:
+    replace_text(record.with_name(f"{record.name}{LOST}"), run)
+    record.unlink()

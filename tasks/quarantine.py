@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hnerf.errors import printable
 from hnerf.files import replace_text
-from tasks.ledger import was_started
+from tasks.ledger import RELEASES, was_started
 
 FOLDER = ".refused"
 REMEDY = (
@@ -16,6 +16,10 @@ REMEDY = (
     "with the folder."
 )
 REPEAT = "If the folder is not to blame, repeat its flow run: prefect flow-run retry ID."
+MACHINE = (
+    f"The folder is not to blame: correct the machine. The capture is started again by itself, {RELEASES} times in "
+    "all; after that, repeat its flow run: prefect flow-run retry ID. This note goes when a run starts or succeeds."
+)
 
 
 def note(capture: Path, why: str, remedy: str = REMEDY) -> None:
@@ -27,11 +31,12 @@ def note(capture: Path, why: str, remedy: str = REMEDY) -> None:
         replace_text(path, f"{text}\n\nSeen {time.strftime('%Y-%m-%d %H:%M:%S %z')}\n")
 
 
-def note_run(capture: Path | str, store: Path, why: str) -> None:
-    """Write why a run gave no result, if its capture was started from a watched folder (not one in a bucket)."""
+def note_run(capture: Path | str, store: Path, why: str, remedy: str = f"{REMEDY} {REPEAT}") -> None:
+    """Write why a run gave no result, and what to do, if its capture was started from a watched folder (not one in a
+    bucket)."""
     if isinstance(capture, Path) and was_started(store, capture):
         with suppress(OSError):  # a folder that is read-only, or gone
-            note(capture, why, f"{REMEDY} {REPEAT}")
+            note(capture, why, remedy)
 
 
 def clear(capture: Path) -> None:

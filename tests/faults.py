@@ -496,6 +496,7 @@ FAULTS = (
     Fault("store-planted-links", "tasks/store", "for path in partial.rglob(\"*\"):", "for path in list[Path]():"),
     Fault("store-replaced-twice", "tasks/store", "old / uuid4().hex", 'old / "one"'),
     Fault("ledger-key", "tasks/ledger", "lost.read_text() if lost.exists() else ''", "''"),
+    Fault("ledger-releases", "tasks/ledger", "if len(runs) < RELEASES:", "if True:"),
     Fault("ledger-empty-note", "tasks/ledger", 'or "none")', 'or "")'),
     Fault("store-bad-input", "tasks/store",
           " or (isinstance(error, InputError) and not isinstance(error, PlaceError))", ""),

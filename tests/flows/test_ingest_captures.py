@@ -13,9 +13,9 @@ from fsspec import filesystem
 from flows import ingest_captures as module
 from flows.ingest_captures import ingest_captures
 from flows.train_subject import train_subject
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 from tasks import quarantine
-from tasks.bucket import Bucket
+from tasks.bucket import VARIABLE, Bucket
 from tasks.source import read_capture
 
 pytestmark = pytest.mark.usefixtures("runs")
@@ -220,6 +220,30 @@ def test_a_failed_run_is_noted_in_its_watched_folder(watched: Path, prefect_api:
     assert text.startswith(f"ada: refused: {watched / 'ada'}: ") and "(flow run " in text
 
 
+def test_a_fault_of_the_machine_uses_up_no_capture_and_is_not_held_against_it(
+    watched: Path, monkeypatch: pytest.MonkeyPatch, prefect_api: str
+) -> None:
+    """The worker's bucket is not there. After three more runs the capture is kept: no machine can train it."""
+    store = watched.parent / "store"
+    look(watched)
+    for again in (["ada"], ["ada"], ["ada"], []):
+        with monkeypatch.context() as misconfigured, pytest.raises(PlaceError):
+            misconfigured.setenv(VARIABLE, f"file://{watched}/unmade")
+            train_subject(watched / "ada", store=store)
+        text = (watched / ".refused" / "ada.txt").read_text()
+        assert text.startswith(f"ada: failed: {VARIABLE}: ") and "refused" not in text and "not to blame" in text
+        assert look(watched) == again
+
+
+def test_a_bucket_that_is_not_there_uses_up_no_capture(
+    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as misconfigured, pytest.raises(PlaceError, match="unmade is not there; make it"):
+        misconfigured.setenv(VARIABLE, f"file://{watched}/unmade")
+        look(watched)
+    assert not runs and look(watched) == ["ada", "bob"]
+
+
 def test_nothing_is_started_if_the_disk_is_nearly_full(
     watched: Path, runs: list[dict[str, Any]], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -361,13 +385,14 @@ def test_a_capture_moved_within_the_bucket_is_started_from_its_new_url(bucket: s
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["adele"]
 
 
-def test_a_run_without_access_to_the_bucket_does_not_restart_the_capture(
-    bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("error", "again"), [(PlaceError("403"), ["ada"]), (InputError("no ETag"), [])])
+def test_a_run_without_access_to_the_bucket_uses_up_no_capture(
+    error: InputError, again: list[str], bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prefect_api: str
 ) -> None:
     store = tmp_path / "store"
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
 
-    with monkeypatch.context() as patch, pytest.raises(InputError, match="403"):
-        patch.setattr(Bucket, "files", Mock(side_effect=InputError("403")))
-        train_subject.fn(f"{bucket}/ada", "demo", store)
-    assert ingest_captures.fn(bucket, "demo", store, 0.0) == []
+    with monkeypatch.context() as patch, pytest.raises(InputError, match=str(error)):
+        patch.setattr(Bucket, "files", Mock(side_effect=error))
+        train_subject(f"{bucket}/ada", "demo", store)
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == again

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.files import now_s
-from tasks.ledger import Ledger, forget, was_started
+from tasks.ledger import Ledger, forget, release, was_started
 
 DIGEST, OTHER = "a" * 64, "b" * 64
 
@@ -22,6 +22,16 @@ def test_a_forgotten_capture_can_be_started_again_under_another_key(tmp_path: Pa
     assert second == f"{first} run of ada" == ledger.start_key(DIGEST)
     ledger.note_started(DIGEST, tmp_path / "eve", "second run")
     assert ledger.seen("seen-ada")
+
+
+def test_a_capture_is_released_three_times_and_then_kept(tmp_path: Path) -> None:
+    ledger = Ledger.of(tmp_path)
+    for digest, name in ((DIGEST, "ada"), (OTHER, "bob")):
+        ledger.note_started(digest, tmp_path / name, "a run")
+    for known in (False, False, False, True):
+        ledger.note_started(DIGEST, tmp_path / "ada", "a run")
+        release(tmp_path, tmp_path / "ada")
+        assert ledger.knows(DIGEST) == known and ledger.knows(OTHER)
 
 
 def test_a_store_without_a_ledger_has_nothing_to_forget(tmp_path: Path) -> None:
