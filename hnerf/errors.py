@@ -26,8 +26,8 @@ class NotApplicableError(InputError):
 
 
 class PlaceError(InputError):
-    """Storage for results that is missing, not accessible or full, or a machine with too few GPUs: not the recording's
-    fault, and not a result of a study; unfinished work is kept."""
+    """Storage for results that is missing, not accessible or full, or a machine with too few GPUs or without a network
+    that is wanted: not the recording's fault, and not a result of a study; unfinished work is kept."""
 
 
 class InvalidAsset(Exception):

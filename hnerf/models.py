@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 from hnerf.files import atomic_folder
 
 NPM_PACKAGE = "@mediapipe/holistic@0.5.1675471629"  # Apache-2.0
@@ -63,12 +63,12 @@ def models_folder() -> Path:
 
 
 def model_file(name: str) -> Path:
-    """Return the path of a network's file; raise InputError if it is missing or its digest differs."""
+    """Return the path of a network's file; raise PlaceError if it is missing or its digest differs."""
     path = models_folder() / name
     if not path.is_file():
-        raise InputError(f"{path}: not there; {ADVICE}")
+        raise PlaceError(f"{path}: not there; {ADVICE}")
     if _sha256(path.read_bytes()) != SHA256[name]:
-        raise InputError(f"{path}: altered or damaged; {ADVICE}")
+        raise PlaceError(f"{path}: altered or damaged; {ADVICE}")
     return path
 
 

@@ -4,7 +4,7 @@ A reader that crashes, or that takes all memory, all processors or the network, 
 run sends it its work pickled; it answers in text, one JSON object per line:
 
     {"log": [logger, level, message]}, {"progress": [what, done, total]}, {"opened": path}, {"printed": text}
-    {"error": "InputError" | "OSError" | "LostWorkerError" | "other", "arguments": [...]}, at most one
+    {"error": "InputError" | "PlaceError" | "OSError" | "LostWorkerError" | "other", "arguments": [...]}, at most one
 """
 
 import ctypes
@@ -26,7 +26,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TextIO
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 from hnerf.processes import end_with_parent
 from hnerf.progress import Progress, listening, report
 from tasks.launcher import KILLED, LostWorkerError
@@ -77,6 +77,7 @@ def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> 
     if error:
         kinds: dict[str, type[Exception]] = {
             "InputError": InputError,
+            "PlaceError": PlaceError,
             "OSError": OSError,
             "LostWorkerError": LostWorkerError,
         }
@@ -162,7 +163,7 @@ def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object
     if isinstance(error, BrokenProcessPool):
         return {"error": "LostWorkerError", "arguments": [f"{opened}: a process of its reader ended: {error}"]}
     if isinstance(error, InputError):
-        return {"error": "InputError", "arguments": [str(error)]}
+        return {"error": "PlaceError" if isinstance(error, PlaceError) else "InputError", "arguments": [str(error)]}
     if isinstance(error, OSError) and number is None:  # our own, for libraries that do not say why
         return {"error": "OSError", "arguments": [str(error)]}
     if isinstance(error, OSError):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hnerf import models
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 
 CONTENTS = {"own.tflite": b"own", "packed.tflite": b"packed", "alexnet.ckpt": b"weights", "three.core.js": b"module"}
 LICENCES = {"licence-apache-2.0.txt", "licence-lpips.txt", "licence-three.txt"}
@@ -58,7 +58,7 @@ def test_all_files_and_their_licences_are_fetched(folder: Path) -> None:
 def test_altered_files_are_fetched_again_and_intact_ones_are_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     models.fetch_models()
     (folder / "packed.tflite").write_bytes(b"other")
-    with pytest.raises(InputError, match=r"packed\.tflite: altered or damaged; run `hnerf models`"):
+    with pytest.raises(PlaceError, match=r"packed\.tflite: altered or damaged; run `hnerf models`"):
         models.model_file("packed.tflite")
     models.fetch_models()
     assert models.model_file("packed.tflite").read_bytes() == b"packed"
@@ -67,7 +67,7 @@ def test_altered_files_are_fetched_again_and_intact_ones_are_not(folder: Path, m
 
 
 def test_the_error_of_a_missing_file_is_one_line(folder: Path) -> None:
-    with pytest.raises(InputError, match=r"models/packed\.tflite: not there; run `hnerf models`$"):
+    with pytest.raises(PlaceError, match=r"models/packed\.tflite: not there; run `hnerf models`$"):
         models.model_file("packed.tflite")
 
 

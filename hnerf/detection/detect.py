@@ -47,8 +47,8 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     Cameras are distributed over as many processes as there are cores. Cameras whose landmarks are in `out` already are
     not processed again. Test cameras are never read, nor are training cameras of the capture's files that `capture`
     lacks. Masks show the subject only; keypoints are of all people, from whom `hnerf.capture.subject` chooses the
-    subject. Raises InputError if a network is missing, nobody is found in any image, the subject is ambiguous, or the
-    subject is too small or always cut off.
+    subject. Raises PlaceError if a network is missing, and InputError if nobody is found in any image, the subject is
+    ambiguous, or the subject is too small or always cut off.
     """
     for name in (POSE_DETECTOR, f"pose_landmark_{settings.size}.tflite"):
         model_file(name)

@@ -10,7 +10,7 @@ class Network:
     """A network with one input, an RGB image (n, n, 3) float32, and outputs in the order of their names."""
 
     def __init__(self, name: str) -> None:
-        """Load a file of `hnerf models`. Raises InputError if it is missing or altered."""
+        """Load a file of `hnerf models`. Raises PlaceError if it is missing or altered."""
         self._interpreter = Interpreter(str(model_file(name)), num_threads=1)
         self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]

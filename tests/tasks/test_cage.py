@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.config import LimitSettings
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 from hnerf.progress import Progress, listening, report
 from tasks.cage import CLONE_NEWNET, CLONE_NEWUSER, run_caged
 from tasks.launcher import LostWorkerError
@@ -117,6 +117,10 @@ def cannot_write(folder: Path) -> None:
     raise OSError("a.png: cannot be written; is the disk full?")
 
 
+def lacks_a_network(folder: Path) -> None:
+    raise PlaceError("packed.tflite: not there; run `hnerf models`")
+
+
 def is_wrong(folder: Path) -> None:
     raise KeyError("camera")
 
@@ -171,6 +175,8 @@ def test_errors_of_the_machine_are_retryable_and_bugs_have_a_traceback(tmp_path:
     assert raised.value.errno is None
     with pytest.raises(LostWorkerError, match="its reader was killed by SIGKILL"):
         run_caged(is_killed, tmp_path, folder=tmp_path)
+    with pytest.raises(PlaceError, match="not there; run `hnerf models`"):
+        run_caged(lacks_a_network, tmp_path, folder=tmp_path)
     with pytest.raises(RuntimeError, match=r"in is_wrong\n(.*\n)*KeyError: 'camera'"):
         run_caged(is_wrong, tmp_path, folder=tmp_path)
 
