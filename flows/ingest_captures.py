@@ -17,7 +17,7 @@ from pydantic import Field
 
 from flows.arguments import StoreFolder
 from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
-from hnerf.config import load_settings
+from hnerf.config import load_settings, require_named_files
 from hnerf.errors import InputError
 from hnerf.files import now_s
 from tasks import quarantine
@@ -68,7 +68,8 @@ def ingest_captures(
     for lost, why in restart_crashed(max_restarts):
         capture = path_or_url(lost.parameters["capture"])
         quarantine.note_run(capture, store, f"failed: {why} (flow run {lost.name}, {lost.id})")
-    load_settings(preset)  # a misspelled one would use up every capture: failed runs are not started again
+    # A misspelled name would use up every capture: failed runs are not started again.
+    require_named_files(load_settings(preset))
     Bucket.configured()  # likewise a bucket that is not there
     started: list[str] = []
     room: int | None = None

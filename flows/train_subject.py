@@ -15,7 +15,7 @@ from flows.preparation import Prepared, missing_cameras, segment_and_fit, segmen
 from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
-from hnerf.config import Settings, load_settings
+from hnerf.config import Settings, load_settings, require_named_files
 from hnerf.errors import InputError, one_line
 from hnerf.evaluation.holdout import held_out_cameras
 from hnerf.tables import table
@@ -73,6 +73,7 @@ def train_subject(
 def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Sequence[str]) -> Trained:
     """Run all stages on a capture, and show the results on the page of the run."""
     settings = load_settings(preset, overrides)
+    require_named_files(settings)
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
     capture = path_or_url(capture)

@@ -61,8 +61,12 @@ def test_each_capture_is_started_once(watched: Path, runs: list[dict[str, Any]])
 
 
 def test_a_misspelled_preset_uses_up_no_capture(watched: Path, runs: list[dict[str, Any]]) -> None:
-    with pytest.raises(InputError, match="fsat: no such preset"):
-        ingest_captures.fn(watched, "fsat", watched.parent / "store", 0.0)
+    """Nor does a file that the preset misspells."""
+    mine = watched.parent / "mine.yaml"
+    mine.write_text("{based_on: fast, fit: {body_model: absent.npz}}")
+    for preset, why in (("fsat", "fsat: no such preset"), (str(mine), r"fit\.body_model: absent\.npz: no such file")):
+        with pytest.raises(InputError, match=why):
+            ingest_captures.fn(watched, preset, watched.parent / "store", 0.0)
     assert not runs and look(watched) == ["ada", "bob"]
 
 

@@ -20,6 +20,7 @@ from flows import train_subject as module
 from flows.train_subject import train_subject
 from hnerf.capture.capture import Capture
 from hnerf.config import load_settings
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from tasks import store
 from tasks.stage import Stage
@@ -175,6 +176,12 @@ def test_a_keypoint_network_of_the_users_own_counts_by_its_bytes(folder: Path, t
         made.append((subject / "detection").resolve())
     made.append((train_subject.fn(folder, "demo", tmp_path / "store", []).subject / "detection").resolve())
     assert made[0] == made[1] and len(set(made)) == 3
+
+
+def test_a_file_that_a_setting_misspells_is_refused_before_any_stage(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^detection\.model: absent\.onnx: no such file"):
+        train_subject.fn(folder, "fast", tmp_path / "store", ["detection.model=absent.onnx"])
+    assert not (tmp_path / "store").exists()
 
 
 def test_stages_that_a_run_skips_are_not_linked(folder: Path, tmp_path: Path) -> None:
