@@ -92,8 +92,10 @@ def photographed_frames(capture: Capture, most: int, texture_px: int) -> list[in
 def _coarse_field_colours(
     avatar: Avatar, posed: BodyFit, layout: UvLayout, texels: Texels, texture_px: int, cavities: np.ndarray
 ) -> np.ndarray:
-    """Return the field's colours at a texture's texels, (N, 3), sampled from a smaller texture."""
-    side_px = min(texture_px, max(FIELD_PX, texture_px // 2))  # no smaller: charts lie a few texels apart
+    """Return the field's colours at a texture's texels, (N, 3), sampled from a smaller texture if there are many."""
+    if texture_px <= FIELD_PX:
+        return field_colours(avatar, posed, texels, cavities)
+    side_px = max(FIELD_PX, texture_px // 2)  # no smaller: charts lie a few texels apart
     coarse = rasterise(layout, side_px)
     image = texture_image(coarse, field_colours(avatar, posed, coarse, cavities), side_px)
     at = np.stack([texels.column.numpy(), texels.row.numpy()], 1)

@@ -19,6 +19,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.hand_points import finger_joints
 from hnerf.body.rig import Rig
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
+from hnerf.side_by_side import side_by_side
 
 # Joint rotations from the A pose, in degrees: about X (to the left), then Y (up), then Z (to the front). The right side
 # mirrors the left. They are near the limits of human motion.
@@ -63,11 +64,12 @@ def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[Extre
     surfaces |= with_expressions(staged)
     bodies_m = {name: staged.rest_points_m + moved_m for name, moved_m in staged.physiques_m.items()}
     surfaces |= {name.capitalize(): (points_m, everything) for name, points_m in bodies_m.items()}
-    return [
-        ExtremePose(name, points_m, shown, float(crossing_faces(points_m, staged.faces[:skin_faces]).mean()))
-        for name, (points_m, shown) in surfaces.items()
-        if shown.any()
-    ]
+
+    def measured(name: str) -> ExtremePose:
+        points_m, shown = surfaces[name]
+        return ExtremePose(name, points_m, shown, float(crossing_faces(points_m, staged.faces[:skin_faces]).mean()))
+
+    return list(side_by_side(measured, [name for name, (_, shown) in surfaces.items() if shown.any()]))
 
 
 def with_expressions(staged: StagedAvatar) -> dict[str, tuple[np.ndarray, np.ndarray]]:

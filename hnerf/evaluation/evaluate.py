@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import trimesh
 
 from hnerf.avatar.avatar import Avatar
@@ -79,12 +80,15 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     found |= {split: score_split(split, views[split], truth, out) for split in views}
     found |= {split: unscored(why) for split, why in unavailable.items()}
     true_meshes = truth.meshes()
-    for split in PRIMARY_SPLITS:
-        if split in unavailable:
-            found[split] |= {"geometry": None, "geometry_reason": unavailable[split]}
-            continue
-        frames = mesh_frames(split_frames(capture, split), true_meshes, settings.max_meshes)
-        found[split] |= score_meshes(avatars[split], frames, true_meshes, out)
+    meshed: dict[str, tuple[Avatar, list[int]]] = {
+        split: (avatars[split], mesh_frames(split_frames(capture, split), true_meshes, settings.max_meshes))
+        for split in PRIMARY_SPLITS
+        if split not in unavailable
+    }
+    for split, scores in score_meshes(meshed, true_meshes, out).items():
+        found[split] |= scores
+    for split in unavailable.keys() & set(PRIMARY_SPLITS):
+        found[split] |= {"geometry": None, "geometry_reason": unavailable[split]}
     found |= collect_held_out(capture, inputs.held_out_folders)
     found["seconds"] = {"rendering": rendered - started, "scores and meshes": time.perf_counter() - rendered}
     write_report(inputs, settings, truth, true_meshes, found, out)
@@ -107,28 +111,39 @@ def mesh_frames(frames: tuple[int, ...], true_meshes: dict[int, trimesh.Trimesh]
 
 
 def score_meshes(
-    avatar: Avatar, frames: list[int], true_meshes: dict[int, trimesh.Trimesh], out: Path
-) -> dict[str, Any]:
-    """Write `meshes/<frame>.ply` of the frames, posed as the avatar's body is; return their mean geometry scores, or
-    null with a reason. If any frame has no surface, the reason says why."""
+    shown: Mapping[str, tuple[Avatar, list[int]]], true_meshes: dict[int, trimesh.Trimesh], out: Path
+) -> dict[str, dict[str, Any]]:
+    """Write `meshes/<frame>.ply` of avatars and frames by split, posed as each avatar's body is; return the mean
+    geometry scores of each split, or null with a reason. If any of its frames has no surface, the reason says why."""
     (out / "meshes").mkdir(exist_ok=True)
 
-    def measure(frame: int) -> tuple[int, dict[str, Any] | None]:
-        mesh = posed_surface(avatar, frame)
+    def measure(split_and_frame: tuple[str, int]) -> tuple[str, dict[str, Any] | str | None]:
+        split, frame = split_and_frame
+        try:
+            mesh = posed_surface(shown[split][0], frame)
+        except InputError as error:  # young or failed models may have no surface, which is a result
+            return split, str(error)
+        log.info("meshed frame %d: %d faces", frame, len(mesh.faces))
         mesh.export(out / "meshes" / f"{frame:06d}.ply")
         if frame not in true_meshes:
-            return len(mesh.faces), None
-        found = geometry.score_geometry(mesh, true_meshes[frame], np.random.default_rng(0))
-        return len(mesh.faces), {"frame": frame} | found
+            return split, None
+        return split, {"frame": frame} | geometry.score_geometry(mesh, true_meshes[frame], np.random.default_rng(0))
 
-    scores = []
-    measured = side_by_side(measure, frames, avatar.body.theta.device)
-    try:
-        for frame, (faces, score) in zip(frames, tracked(measured, "meshes", len(frames)), strict=True):
-            log.info("meshed frame %d: %d faces", frame, faces)
-            scores += [score] if score else []
-    except InputError as error:  # young or failed models may have no surface, which is a result
-        return {"geometry": None, "geometry_reason": str(error)}
+    found: dict[str, list[Any]] = {split: [] for split in shown}
+    every = [(split, frame) for split, (_, frames) in shown.items() for frame in frames]
+    device = next((avatar.body.theta.device for avatar, _ in shown.values()), torch.device("cpu"))
+    for split, score in tracked(side_by_side(measure, every, device), "meshes", len(every)):
+        found[split].append(score)
+    return {split: _mean_scores(scores) for split, scores in found.items()}
+
+
+def _mean_scores(found: list[dict[str, Any] | str | None]) -> dict[str, Any]:
+    """Return the means of scores of surfaces; in place of a score, there may be the reason why a frame has no surface,
+    or None if it has no true one."""
+    for reason in found:
+        if isinstance(reason, str):
+            return {"geometry": None, "geometry_reason": reason}
+    scores = [score for score in found if isinstance(score, dict)]
     if not scores:
         return {"geometry": None, "geometry_reason": "the capture has no ground-truth surface in these frames"}
     means = {name: float(np.mean([score[name] for score in scores])) for name in scores[0] if name != "frame"}

@@ -14,7 +14,7 @@ from hnerf.capture.capture import read_rgba
 from hnerf.config import EvaluationSettings
 from hnerf.detection.people import PICTURE, REPORT
 from hnerf.evaluation import charts
-from hnerf.evaluation.galleries import Gallery, GalleryPicture, surface_row, view_row
+from hnerf.evaluation.galleries import Gallery, GalleryPicture, Row, surface_row, view_row
 from hnerf.evaluation.ground_truth import GIVEN_MASKED_IMAGE, MASKED_IMAGE, UNDER_GIVEN_MASKS, GroundTruth
 from hnerf.evaluation.images import TUNED_ON
 from hnerf.evaluation.inputs import EvaluationInputs
@@ -32,6 +32,7 @@ from hnerf.evaluation.views import (
 )
 from hnerf.files import png_data_uri
 from hnerf.results.scores import HeldOutCamera, Metrics, Split
+from hnerf.side_by_side import side_by_side
 from hnerf.tables import pick, shown
 
 FIGURES = (  # key in a split's scores, name, unit, format, meaning
@@ -168,13 +169,14 @@ def galleries(
         if split in SPLITS and found[split]["per_image"]:
             worst = min(found[split]["per_image"], key=lambda score: score["psnr"])
             views[View(split, worst["camera"], worst["frame"])] = f"the worst of this split, {worst['psnr']:.1f} dB"
-        rows = [
-            view_row(view, read_rgba(view.path(out)), inputs, truth, note, inputs.fitted, _other_columns(view, out))
-            for view, note in views.items()
-            if view.path(out).exists()  # a method without novel poses has no renderings of them
-        ]
-        if rows:
-            made.append(Gallery(*_gallery_text(split, inputs), rows))
+        rendered = [view for view in views if view.path(out).exists()]  # none of new poses, if a method has none
+
+        def row(view: View, notes: dict[View, str] = views) -> Row:
+            others = _other_columns(view, out)
+            return view_row(view, read_rgba(view.path(out)), inputs, truth, notes[view], inputs.fitted, others)
+
+        if rendered:
+            made.append(Gallery(*_gallery_text(split, inputs), list(side_by_side(row, rendered))))
     if found["holdout"]:
         made.append(held_out_gallery(inputs, found["holdout"]["cameras"]))
     return [*made, surface_gallery(inputs, true_meshes, out)]
@@ -214,13 +216,18 @@ def _gallery_text(split: str, inputs: EvaluationInputs) -> tuple[str, str]:
 def surface_gallery(inputs: EvaluationInputs, true_meshes: dict[int, trimesh.Trimesh], out: Path) -> Gallery:
     """Return a gallery of the first mesh of the training frames and of the novel-pose frames, front and back."""
     frames = sorted(int(path.stem) for path in (out / "meshes").glob("*.ply"))
-    capture, body, rows = inputs.capture, inputs.avatar.body, []
-    for members, note in ((capture.train_frames, "training pose"), (capture.novel_pose_frames, "new pose")):
-        for frame in [f for f in frames if f in members][:1]:
-            mesh = trimesh.load_mesh(out / "meshes" / f"{frame:06d}.ply", process=False)
-            root = body.root[body.index(frame)].cpu().numpy()
-            rows.append(surface_row(frame, mesh, true_meshes.get(frame), root, note))
-    return Gallery("Surface", "The zero surface of the signed distance, without colour.", rows)
+    capture, body = inputs.capture, inputs.avatar.body
+    chosen = [[f for f in frames if f in members][:1] for members in (capture.train_frames, capture.novel_pose_frames)]
+    notes = {f: note for of_kind, note in zip(chosen, ("training pose", "new pose"), strict=True) for f in of_kind}
+
+    def row(frame: int) -> Row:
+        mesh = trimesh.load_mesh(out / "meshes" / f"{frame:06d}.ply", process=False)
+        root = body.root[body.index(frame)].cpu().numpy()
+        return surface_row(frame, mesh, true_meshes.get(frame), root, notes[frame])
+
+    return Gallery(
+        "Surface", "The zero surface of the signed distance, without colour.", list(side_by_side(row, notes))
+    )
 
 
 def training_charts(history_path: Path, out: Path) -> list[GalleryPicture]:

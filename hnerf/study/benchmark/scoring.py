@@ -129,7 +129,7 @@ def score_views(
         return found | {"geometry": None, "geometry_reason": "the study requests no surface here"}
     true_meshes = scene.truth.meshes()
     frames = [f for f in mesh_frames(split_frames(scene.capture, split), true_meshes, meshes) if f in true_meshes]
-    return found | score_meshes(avatar, frames, true_meshes, out)
+    return found | score_meshes({split: (avatar, frames)}, true_meshes, out)[split]
 
 
 def write_pictures(scene: ScoringScene, split: str, per_image: list[ImageScores], out: Path) -> list[Picture]:
