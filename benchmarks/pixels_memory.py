@@ -69,7 +69,7 @@ def run_process(rank: int, processes: int, folder: Path) -> None:
     here.barrier()
     found["before"] = process_bytes("Pss")
     here.barrier()
-    pixels = gather_pixels(capture, masks, body, None, {}, folder, here)
+    pixels = gather_pixels(capture, masks, body, None, {}, folder, here, with_plates=False)
     found["anonymous"] = capture.peak_bytes
     for column in (pixels.colour, pixels.person, pixels.edge):
         column.numpy().view(np.uint8).max()  # reads every byte; on bools max() would stop at the first True

@@ -77,7 +77,6 @@ def ablate(
 def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], dict[str, str]]:
     """Return the settings of each row, the full method first, and why other ablations have no row. Raises InputError
     for unknown names, and for settings that no study accepts."""
-    check_presets([full])
     known = {path.stem: path for path in sorted(ABLATIONS.glob("*.yaml"))}
     unknown = sorted(set(only) - set(known))
     if unknown:
@@ -91,6 +90,7 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
             left_out[name] = "off already"
         else:
             rows[name] = settings
+    check_presets(rows.values())
     return rows, left_out
 
 

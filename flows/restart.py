@@ -20,8 +20,8 @@ AGAIN = "crashed; begun again"
 # A worker with a limit ends if it is offered a run that it has not released yet. Before it releases one, it imports the
 # flow once more, for its hooks, which takes a minute on a busy machine.
 RELEASE = timedelta(minutes=2)
-# Two heartbeats (prefect.toml), and what they take to arrive. A server that was away for longer than the automation's
-# silence takes living runs for lost before they can reach it.
+# Two heartbeats of 30 s (prefect.toml), and 15 s for delivery. A server that was away for longer than the automation's
+# silence takes living runs for lost before their heartbeats reach it.
 QUIET = timedelta(seconds=75)
 HEARTBEAT = "prefect.flow-run.heartbeat"
 PAGE = 100  # runs per request; the server returns at most 200

@@ -25,7 +25,7 @@ from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.ledger import forget, release
-from tasks.limits import set_limits
+from tasks.limits import StalledError, set_limits
 from tasks.policy import is_of_the_machine
 from tasks.quarantine import MACHINE, clear, note_run
 from tasks.quiet import EXPECTED
@@ -134,15 +134,16 @@ def ingested(store: Store, source: Source, capture: Path | str, settings: Settin
 @train_subject.on_failure
 def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Write the reason into the watched folder, if the capture was started from there. If the machine is to blame,
-    release the capture, so that it may be started again."""
+    release the capture, so that it may be started again; a stage that stalled would only stall again for hours."""
     capture, store = path_or_url(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
     error = state.result(raise_on_failure=False)
     if isinstance(error, Exception):
         why = str(error) if isinstance(error, EXPECTED) else f"{type(error).__name__}: {one_line(error)}"
         why = f"{why} (flow run {flow_run.name}, {flow_run.id})"
-        if is_of_the_machine(error):
+        if is_of_the_machine(error) and not isinstance(error, StalledError):
             note_run(capture, store, f"failed: {why}", MACHINE)
-            release(store, capture)
+            with suppress(OSError):  # of a full disk
+                release(store, capture, str(flow_run.id))
         else:
             note_run(capture, store, f"{'refused' if isinstance(error, InputError) else 'failed'}: {why}")
 

@@ -9,6 +9,7 @@ UNREACHABLE = (
     errno.EIO, errno.ESTALE, errno.EREMOTEIO, errno.ETIMEDOUT, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOTCONN,
     errno.ECONNABORTED, errno.EMFILE, errno.ENFILE, errno.ENOMEM,
 )  # fmt: skip
+OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "ALLOC_FAILED", "Failed to allocate")
 REASON = "hnerf: "  # begins the line on standard error that says why a process ends
 MAX_MESSAGE = 2000  # characters; text from a stranger's file may be longer
 
@@ -26,8 +27,8 @@ class NotApplicableError(InputError):
 
 
 class PlaceError(InputError):
-    """Storage for results that is missing, not accessible or full, or a machine with too few GPUs or without a network
-    that is wanted: not the recording's fault, and not a result of a study; unfinished work is kept."""
+    """Storage for results that is missing, not accessible or full, or a machine with too few GPUs or without a file of
+    `hnerf models`: not the recording's fault, and not a result of a study; unfinished work is kept."""
 
 
 class InvalidAsset(Exception):
@@ -41,9 +42,11 @@ def raise_if_unreachable(error: Exception) -> None:
 
 
 def is_out_of_memory(error: object) -> bool:
-    """Return whether this machine or its GPU had no memory left. PyTorch's errors are known by their message: naming
-    their classes would import it, and a GPU without memory for a first process raises another class."""
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "out of memory" in str(error))
+    """Return whether this machine or its GPU had no memory left. Errors of PyTorch and Warp are known by the first line
+    of their message: they share no class, and naming those they have would import PyTorch."""
+    first, _, _ = str(error).partition("\n")
+    told = isinstance(error, RuntimeError) and any(phrase in first for phrase in OUT_OF_MEMORY)
+    return isinstance(error, MemoryError) or told
 
 
 def printable(text: str) -> str:

@@ -46,13 +46,13 @@ class Bucket:
 
     @staticmethod
     def configured() -> "Bucket | None":
-        """Return the bucket that the environment names, None if it names none. Raises InputError if that bucket does
-        not exist."""
+        """Return the bucket that the environment names, None if it names none. Raises PlaceError if that bucket cannot
+        be used."""
         url = os.environ.get(VARIABLE, "")
         try:
             return Bucket.at(url) if url else None
         except InputError as error:
-            raise type(error)(f"{VARIABLE}: {error}") from None
+            raise PlaceError(f"{VARIABLE}: {error}") from None
 
     @staticmethod
     def at(url: str) -> "Bucket":

@@ -26,7 +26,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TextIO
 
-from hnerf.errors import InputError, PlaceError
+from hnerf.errors import InputError, PlaceError, is_out_of_memory
 from hnerf.processes import end_with_parent
 from hnerf.progress import Progress, listening, report
 from tasks.launcher import KILLED, LostWorkerError
@@ -155,7 +155,7 @@ def _main(parent: int) -> None:
 def _told(error: Exception, opened: Path, memory_bytes: int) -> dict[str, object]:
     """Return the message to the run about an error. If a limit was exceeded, it names the file that was opened last."""
     number = error.errno if isinstance(error, OSError) else None
-    if isinstance(error, MemoryError) or getattr(error, "code", None) == NO_MEMORY:
+    if is_out_of_memory(error) or getattr(error, "code", None) == NO_MEMORY:
         why = f"reading it needs more than {memory_bytes / (1 << 30):g} GiB"
         error = InputError(f"{opened}: {why}; export it again, or raise limits.reader_gib")
     elif number in BEYOND:

@@ -1,7 +1,7 @@
 """The ledger of a watched folder: which captures were started, by their content.
 
 <store>/ingested/<digest>         the folder and the flow run of a capture that was started
-<store>/ingested/<digest>.lost    the flow run that did not find its folder, or whose machine failed; it may start again
+<store>/ingested/<digest>.lost    the same, if the run did not find its folder or its machine failed: it may start again
 <store>/ingested/<digest>.failed  the flow runs after which the capture was released because their machine failed
 <store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
 <store>/ingested/new-<listing>    a listing in a bucket that is not started yet; written when it was first seen
@@ -63,25 +63,26 @@ class Ledger:
         identity, lost = self.root / "id", self.root / f"{digest}{LOST}"
         if not identity.exists():
             replace_text(identity, uuid4().hex)
-        return f"{identity.read_text()} {digest} {lost.read_text() if lost.exists() else ''}".strip()
+        lines = lost.read_text(errors="replace").splitlines() if lost.exists() else []
+        return " ".join([identity.read_text(), digest, *lines[-1:]])  # the last line names the run
 
 
 def forget(store: Path, capture: Path | str) -> None:
     """Release the capture that was started from a folder or URL where it no longer is, so that the next look starts it
     from where it is now."""
-    for record, run in _started_from(store, capture):
-        _forget(record, run)
+    for record, _ in _started_from(store, capture):
+        _forget(record)
 
 
-def release(store: Path, capture: Path | str) -> None:
-    """Release the capture that was started from a folder or URL and failed through no fault of its own, so that the
-    next look starts it again, at most RELEASES times."""
+def release(store: Path, capture: Path | str, failed_run: str) -> None:
+    """Release the capture that a run was started for, which failed through no fault of the capture, so that the next
+    look starts it again, at most RELEASES times."""
     for record, run in _started_from(store, capture):
         failed = record.with_name(f"{record.name}{FAILED}")
         runs = failed.read_text(errors="replace").splitlines() if failed.exists() else []
-        if len(runs) < RELEASES:
+        if run == failed_run and len(runs) < RELEASES:
+            _forget(record)
             replace_text(failed, "\n".join([*runs, run, ""]))
-            _forget(record, run)
 
 
 def was_started(store: Path, capture: Path) -> bool:
@@ -96,6 +97,5 @@ def _started_from(store: Path, capture: Path | str) -> list[tuple[Path, str]]:
     return [(record, text.partition("\n")[2].strip()) for record, text in records if text.partition("\n")[0] == started]
 
 
-def _forget(record: Path, run: str) -> None:
-    replace_text(record.with_name(f"{record.name}{LOST}"), run)
-    record.unlink()
+def _forget(record: Path) -> None:
+    record.rename(record.with_name(f"{record.name}{LOST}"))  # needs no space on a full disk

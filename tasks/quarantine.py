@@ -17,8 +17,9 @@ REMEDY = (
 )
 REPEAT = "If the folder is not to blame, repeat its flow run: prefect flow-run retry ID."
 MACHINE = (
-    f"The folder is not to blame: correct the machine. The capture is started again by itself, {RELEASES} times in "
-    "all; after that, repeat its flow run: prefect flow-run retry ID. This note goes when a run starts or succeeds."
+    "The folder is probably not to blame: correct the machine. The capture is started again by itself, "
+    f"{RELEASES} times in all; after that, repeat its flow run: prefect flow-run retry ID. This note goes when a run "
+    "starts or succeeds."
 )
 
 

@@ -19,7 +19,7 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.render.motion import select_poses
 from hnerf.side_by_side import side_by_side
 
-LEAST_FIELD_PX = 256  # side of the field's texture
+LEAST_FIELD_PX = 256  # side of the field's texture; charts lie a few texels apart
 MOST_TEXELS = 1 << 29  # of all photographs together: what they show is kept, about 4 bytes each
 CAVITY_BRIGHTNESS = 0.3  # factor of sRGB values
 
@@ -94,7 +94,7 @@ def _coarse_field_colours(
 ) -> np.ndarray:
     """Return the field's colours at a texture's texels, (N, 3), sampled from a smaller texture: the field has less
     detail than the photographs that it is blended with."""
-    side_px = min(texture_px, max(LEAST_FIELD_PX, texture_px // 2))  # no smaller: charts lie a few texels apart
+    side_px = min(texture_px, max(LEAST_FIELD_PX, texture_px // 2))
     coarse = rasterise(layout, side_px)
     image = texture_image(coarse, field_colours(avatar, posed, coarse, cavities), side_px)
     at = np.stack([texels.column.numpy(), texels.row.numpy()], 1)

@@ -38,7 +38,7 @@ log = logging.getLogger("hnerf.asset")
 
 def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.ndarray, levels: Sequence[Level]) -> str:
     """Write the page of an avatar. Return its name, or, if three.js is not installed, a line that says so, which is
-    logged, too. Raises InputError if a file of three.js is altered.
+    logged, too. Raises PlaceError if a file of three.js is altered.
 
     stage_from_world (3, 3): from the capture's world to the avatar's; levels: of detail, the first that of the file.
     The texture is halved until the page has at most MAX_BYTES; if that does not suffice, a warning is logged.
@@ -123,7 +123,7 @@ def _photograph(capture: Capture, camera: str, frame: int) -> dict[str, Any]:
 
 def _modules() -> dict[str, str]:
     """Return the sources by the names under which they import each other: "three", "three/..." and "viewer/...". Raises
-    InputError if a file of three.js is missing or altered."""
+    PlaceError if a file of three.js is missing or altered."""
     three = {f"three/{name}": model_file(name).read_text(encoding="utf-8") for name in THREE_SHA256}
     three = {name: RELATIVE_IMPORT.sub(r"from 'three/\1'", source) for name, source in three.items()}
     paths = [path for path in sorted(PAGE.glob("*.js")) if path.name != "boot.js"]

@@ -42,7 +42,7 @@ class Lpips:
     """The LPIPS distance with one backbone."""
 
     def __init__(self, name: str = LPIPS_ALEXNET) -> None:
-        """Load the weights file `name`. Raises InputError if it is missing or altered."""
+        """Load the weights file `name`. Raises PlaceError if it is missing or altered."""
         self.layers, body = NETWORKS[name]
         stored = read_pickle(model_file(name))
         kinds = [layer for layer in self.layers if isinstance(layer, Convolution)]

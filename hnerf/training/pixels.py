@@ -27,8 +27,8 @@ class PixelRays(Rays):
 class CellErrors:
     """The colour errors of training, by cell of the image.
 
-    mean (C,): in each step, the mean of a cell's errors and of what it had before, which counts as one more error; 0 in
-    cells that no ray has met.
+    mean (C,): 0 in cells that no ray has met. Each step replaces the value of a cell by the mean of that value and the
+    step's errors in it; so the first errors are averaged with 0, which costs nothing measurable (docs/experiments.md).
     """
 
     def __init__(self, cells: int):

@@ -83,7 +83,9 @@ class Trainer:
         logger.info("gathering pixels")
         visible_pixels = None if self.field.whole_images else self.field.visible_pixels
         uniform = self.field.models_background  # as the paper draws
-        self.pixels = gather_pixels(capture, masks, body, visible_pixels, self.gains, out, processes, not uniform)
+        self.pixels = gather_pixels(
+            capture, masks, body, visible_pixels, self.gains, out, processes, with_plates=not uniform
+        )
         cell = self.pixels.cell
         self.errors = None if uniform or cell is None else CellErrors(int(cell.max()) + 1)
         seen = self.pixels.starts.diff() > 0  # False where all masks of a frame were dropped

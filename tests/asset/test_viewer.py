@@ -18,7 +18,7 @@ from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.viewer import MAX_BYTES, _modules, lower_indices, recording, write_viewer
 from hnerf.capture.capture import Capture
-from hnerf.errors import InputError
+from hnerf.errors import PlaceError
 from hnerf.evaluation.pictures import cast_pixels
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.models import THREE_SHA256, has_model
@@ -83,7 +83,7 @@ def test_without_three_js_no_page_is_written_and_an_altered_one_is_refused(
     reason = write_viewer(page, glb, capture(), staged.stage_from_world, [])
     assert reason == "no viewer.html: three.js is not installed; run `hnerf models`"
     (tmp_path / last).write_text("// an older version")
-    with pytest.raises(InputError, match=rf"/{others[0]}: altered or damaged; run `hnerf models`$"):
+    with pytest.raises(PlaceError, match=rf"/{others[0]}: altered or damaged; run `hnerf models`$"):
         write_viewer(page, glb, capture(), staged.stage_from_world, [])
     assert not page.exists()
 

@@ -127,6 +127,13 @@ def test_unknown_names_are_refused() -> None:
         choose(load_settings("fast"), ["no-hair"])
 
 
+def test_a_row_that_names_a_missing_file_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own-masks.yaml").write_text("segmentation: {model: absent.onnx}")
+    monkeypatch.setattr(module, "ABLATIONS", tmp_path)
+    with pytest.raises(InputError, match=r"^segmentation\.model: absent\.onnx: no such file"):
+        choose(load_settings("fast"), [])
+
+
 def test_the_table_equals_one_written_by_hand() -> None:
     bare = {"psnr": None, "ssim": None, "mask_iou": None, "geometry": None}
     full = {"novel_view": SPLIT, "novel_pose": SPLIT, "novel_pose_posed": bare, "novel_pose_tracked": SPLIT}

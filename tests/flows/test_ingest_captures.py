@@ -14,8 +14,9 @@ from flows import ingest_captures as module
 from flows.ingest_captures import ingest_captures
 from flows.train_subject import train_subject
 from hnerf.errors import InputError, PlaceError
-from tasks import quarantine
+from tasks import ledger, quarantine
 from tasks.bucket import VARIABLE, Bucket
+from tasks.limits import StalledError
 from tasks.source import read_capture
 
 pytestmark = pytest.mark.usefixtures("runs")
@@ -42,6 +43,16 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     monkeypatch.setattr(module, "unfinished_runs", lambda: 0)
     monkeypatch.setattr(module, "restart_crashed", lambda _: [])
     return asked
+
+
+def every_run_is_the_one_that_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the ledger take runs that tests start by hand for those of the fake server."""
+
+    def release(store: Path, capture: Path | str, _: str) -> None:
+        for _, run in ledger._started_from(store, capture):
+            ledger.release(store, capture, run)
+
+    monkeypatch.setattr("flows.train_subject.release", release)
 
 
 def look(watched: Path, settle_s: float = 0.0, max_unfinished: int = 20) -> list[str]:
@@ -230,6 +241,7 @@ def test_a_fault_of_the_machine_uses_up_no_capture_and_is_not_held_against_it(
     """The worker's bucket is not there. After three more runs the capture is kept: no machine can train it."""
     store = watched.parent / "store"
     look(watched)
+    every_run_is_the_one_that_was_started(monkeypatch)
     for again in (["ada"], ["ada"], ["ada"], []):
         with monkeypatch.context() as misconfigured, pytest.raises(PlaceError):
             misconfigured.setenv(VARIABLE, f"file://{watched}/unmade")
@@ -237,6 +249,19 @@ def test_a_fault_of_the_machine_uses_up_no_capture_and_is_not_held_against_it(
         text = (watched / ".refused" / "ada.txt").read_text()
         assert text.startswith(f"ada: failed: {VARIABLE}: ") and "refused" not in text and "not to blame" in text
         assert look(watched) == again
+
+
+def test_a_capture_whose_stage_stalled_is_not_started_again(
+    watched: Path, monkeypatch: pytest.MonkeyPatch, prefect_api: str
+) -> None:
+    every_run_is_the_one_that_was_started(monkeypatch)
+    look(watched)
+    with monkeypatch.context() as patch, pytest.raises(StalledError):
+        patch.setattr(
+            "flows.train_subject.train_avatar", Mock(side_effect=StalledError("detection: no progress", True))
+        )
+        train_subject(watched / "ada", store=watched.parent / "store")
+    assert "not to blame, repeat" in (watched / ".refused" / "ada.txt").read_text() and look(watched) == []
 
 
 def test_a_bucket_that_is_not_there_uses_up_no_capture(
@@ -394,6 +419,7 @@ def test_a_run_without_access_to_the_bucket_uses_up_no_capture(
     error: InputError, again: list[str], bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prefect_api: str
 ) -> None:
     store = tmp_path / "store"
+    every_run_is_the_one_that_was_started(monkeypatch)
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
 
     with monkeypatch.context() as patch, pytest.raises(InputError, match=str(error)):

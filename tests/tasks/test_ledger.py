@@ -1,5 +1,6 @@
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -30,8 +31,19 @@ def test_a_capture_is_released_three_times_and_then_kept(tmp_path: Path) -> None
         ledger.note_started(digest, tmp_path / name, "a run")
     for known in (False, False, False, True):
         ledger.note_started(DIGEST, tmp_path / "ada", "a run")
-        release(tmp_path, tmp_path / "ada")
+        release(tmp_path, tmp_path / "ada", "another run")  # such as an earlier one that is repeated by hand
+        assert ledger.knows(DIGEST)
+        release(tmp_path, tmp_path / "ada", "a run")
         assert ledger.knows(DIGEST) == known and ledger.knows(OTHER)
+
+
+def test_a_capture_is_released_even_if_its_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ledger = Ledger.of(tmp_path)
+    ledger.note_started(DIGEST, tmp_path / "ada", "a run")
+    monkeypatch.setattr("tasks.ledger.replace_text", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space"):
+        release(tmp_path, tmp_path / "ada", "a run")
+    assert not ledger.knows(DIGEST)
 
 
 def test_a_store_without_a_ledger_has_nothing_to_forget(tmp_path: Path) -> None:
