@@ -9,6 +9,7 @@ UNREACHABLE = (
     errno.EIO, errno.ESTALE, errno.EREMOTEIO, errno.ETIMEDOUT, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOTCONN,
     errno.ECONNABORTED, errno.EMFILE, errno.ENFILE, errno.ENOMEM,
 )  # fmt: skip
+# In messages of PyTorch on a GPU and on a CPU, of cuBLAS, and of Warp.
 OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "ALLOC_FAILED", "Failed to allocate")
 REASON = "hnerf: "  # begins the line on standard error that says why a process ends
 MAX_MESSAGE = 2000  # characters; text from a stranger's file may be longer

@@ -217,17 +217,17 @@ def surface_gallery(inputs: EvaluationInputs, true_meshes: dict[int, trimesh.Tri
     """Return a gallery of the first mesh of the training frames and of the novel-pose frames, front and back."""
     frames = sorted(int(path.stem) for path in (out / "meshes").glob("*.ply"))
     capture, body = inputs.capture, inputs.avatar.body
-    chosen = [[f for f in frames if f in members][:1] for members in (capture.train_frames, capture.novel_pose_frames)]
-    notes = {f: note for of_kind, note in zip(chosen, ("training pose", "new pose"), strict=True) for f in of_kind}
+    notes: dict[int, str] = {}
+    for members, note in ((capture.train_frames, "training pose"), (capture.novel_pose_frames, "new pose")):
+        notes |= dict.fromkeys([frame for frame in frames if frame in members][:1], note)
 
     def row(frame: int) -> Row:
         mesh = trimesh.load_mesh(out / "meshes" / f"{frame:06d}.ply", process=False)
         root = body.root[body.index(frame)].cpu().numpy()
         return surface_row(frame, mesh, true_meshes.get(frame), root, notes[frame])
 
-    return Gallery(
-        "Surface", "The zero surface of the signed distance, without colour.", list(side_by_side(row, notes))
-    )
+    rows = list(side_by_side(row, notes))
+    return Gallery("Surface", "The zero surface of the signed distance, without colour.", rows)
 
 
 def training_charts(history_path: Path, out: Path) -> list[GalleryPicture]:

@@ -29,6 +29,10 @@ def test_alpha_from_sdf_by_hand():
     assert alpha[0].tolist() == pytest.approx([1 / 3, 1 / 2, 0.0])
 
 
+def test_the_only_sample_of_a_ray_is_its_last():
+    assert alpha_from_sdf(torch.tensor([[-1.0], [1.0]]), torch.tensor(10.0)).tolist() == [[0.0], [0.0]]
+
+
 def test_alpha_from_sdf_is_independent_of_sampling():
     """A ray that passes at 5 mm from the surface has a coverage of 1 - Phi(5 mm) / Phi(far), whatever its number of
     samples."""
