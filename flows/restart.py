@@ -40,19 +40,19 @@ def restart_crashed(max_restarts: int) -> list[tuple[FlowRun, str]]:
     RELEASE. Each is restarted at most `max_restarts` times, because the run itself may be what ends the process, even
     before the server counts it as running. Runs that crash once more become failed; return these, with the reason.
 
-    A run whose process may live is left alone until it has been silent for QUIET. It stays Crashed, which it can leave
-    by completing: set back to Running, it would in the end release a slot that it no longer holds."""
+    A run whose process may still be running is left alone until it has been silent for QUIET. It stays Crashed unless
+    it completes: set back to Running, it would finally release a slot that it no longer holds."""
     given_up = []
     with get_client(sync_client=True) as client:
         for run in _all_runs(client, StateType.CRASHED):
             if datetime.now(UTC) - _last_sign(client, run) < QUIET:
-                log.info("%s crashed, and its process may live: it is not begun again yet", run.name)
+                log.info("%s crashed, but its process may still be running: not restarted yet", run.name)
                 continue
             before = [state.message == AGAIN for state in client.read_flow_run_states(run.id)].count(True)
             if before < max_restarts:
                 again: State[None] = Scheduled(scheduled_time=datetime.now(UTC) + RELEASE, message=AGAIN)
                 client.set_flow_run_state(run.id, again, force=True)
-                log.warning("%s crashed and is begun again, %d of %d times", run.name, before + 1, max_restarts)
+                log.warning("%s crashed and is restarted, attempt %d of %d", run.name, before + 1, max_restarts)
             else:
                 lost = f"its process or machine was lost {before + 1} times; the run itself may end it"
                 failed: State[None] = Failed(message=lost)

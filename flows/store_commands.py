@@ -129,7 +129,7 @@ def add_store_commands(store: argparse.ArgumentParser) -> None:
     added["gc"].add_argument("--yes", action="store_true", help=what)
     what = "keep the results of the N newest runs of each subject that made an asset (default: 1)"
     added["gc"].add_argument("--keep", type=number(int, 1, MAX_COUNT), default=1, metavar="N", help=what)
-    what = "only what has not been used for so long: 30d, 12h, 0 (default: 1d)"
+    what = "only what has been unused for this long: 30d, 12h, 0 (default: 1d)"
     added["gc"].add_argument("--older", type=duration_s, default="1d", metavar="TIME", help=what)
     added["export"].add_argument("--out", type=path, help="new file to write (default: NAME.tar)")
     added["import"].add_argument("archive", type=path, help="archive of `hnerf store export`")

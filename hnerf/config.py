@@ -43,7 +43,7 @@ class CaptureSettings(Section):
     """Settings of ingestion."""
 
     max_side_px: int = Field(default=1024, ge=16)  # larger images are shrunk to this longest side at ingestion
-    max_frames: int = Field(default=60, ge=1)  # most training frames, evenly spaced, if capture.toml lists none
+    max_frames: int = Field(default=60, ge=1)  # training frames at most, evenly spaced, if capture.toml lists none
 
 
 class SyntheticSettings(Section):
@@ -65,6 +65,8 @@ class SyntheticSettings(Section):
 
 
 class DetectionSettings(Section):
+    """Settings of the detection of people and hands."""
+
     excluded_from_key: ClassVar[tuple[str, ...]] = ("hands",)  # a stage of their own
     source: Literal["recording", "network", "both"] | None = None  # null: see docs/formats.md, From a network
     size: Literal["heavy", "full", "lite"] = "heavy"  # of the landmark network
@@ -85,7 +87,7 @@ class SegmentationSettings(Section):
     excluded_from_key: ClassVar[tuple[str, ...]] = ("rounds", "still_px")  # the flow uses them: it repeats the stage
     reach: float = Field(default=0.13, gt=0)  # of clothes and hair beyond the limbs, in body heights
     model: Path | None = None  # ONNX segmentation network; comes before clean plates, after given masks
-    rounds: int = Field(default=3, ge=1)  # most rounds of fit and segmentation, if there are neither masks nor plates
+    rounds: int = Field(default=3, ge=1)  # number of rounds at most, if there are neither masks nor plates
     still_px: float = Field(default=0.5, gt=0)  # rounds end when mask edges move less than this on average
 
 
@@ -99,7 +101,7 @@ class FitSettings(Section):
     body_model: Literal["anny"] | Path = "anny"  # or the path of an SMPL, SMPL-H or SMPL-X file (.npz, .pkl)
     keypoint_m: float = Field(default=0.02, gt=0)  # std of a keypoint seen with full confidence
     keypoint_outlier_m: float = Field(default=0.15, gt=0)  # a keypoint farther off counts as an outlier
-    offset_m: float = Field(default=0.02, gt=0)  # std of the detector's place of a keypoint about the body model's
+    offset_m: float = Field(default=0.02, gt=0)  # std of a keypoint's offset: detector minus body model
     stature_m: float = Field(default=1.72, gt=0)  # mean height of people
     stature_std_m: float = Field(default=0.08, gt=0)  # std of the height of people
     acceleration_mps2: float = Field(default=10.0, gt=0)  # std of the trunk; limbs have two to four times as much
@@ -121,7 +123,7 @@ class FieldSettings(Section):
     tunes_poses: ClassVar[bool] = False
     models_motion: ClassVar[bool] = True
     no_new_poses: ClassVar[str] = ""
-    kind: str  # of field, which decides the other settings of this section
+    kind: str  # kind of field; decides the other settings of this section
     scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge; unit of sigma_h, gamma and the root's T
 
 
@@ -252,7 +254,7 @@ class TrainingSettings(Section):
     steps: int = Field(default=0, ge=0)  # 0: chosen from the scene
     seconds: float | None = Field(default=None, gt=0)  # time limit for the field's steps; null: none
     novel_pose_steps: int = Field(default=100, ge=0)  # to tune the poses of novel frames against the finished field
-    frames_per_step: int = Field(default=8, ge=1)  # whose rays make one step
+    frames_per_step: int = Field(default=8, ge=1)  # frames whose rays make up one step
     rays_per_frame: int = Field(default=192, ge=1)  # at frames_per_step frames; fewer frames share all rays
     pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0: keep the fitted poses and shape
     one_posture: bool | None = None  # one posture in all training frames; null: chosen from the scene
@@ -294,10 +296,10 @@ class AssetSettings(Section):
     grid_cells: int = Field(default=256, ge=16, le=1024)  # of marching cubes, along the longest side
     topology: Literal["auto", "registered", "captured", "both"] = "auto"  # of the mesh: see docs/asset.md, Both meshes
     faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered mesh has the body model's
-    level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # most triangles of each lower level of detail
+    level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # maximum number of triangles of each lower level
     texture_px: int | None = Field(default=None, ge=16, le=8192)  # side of the texture; null: see docs/asset.md
     texture_poses: int = Field(default=3, ge=1)  # poses whose median gives the field's colour of a texel
-    photograph_frames: int = Field(default=16, ge=0)  # most frames photographed for the texture; 0: the field alone
+    photograph_frames: int = Field(default=16, ge=0)  # maximum number of frames for the texture; 0: the field alone
     normal_map_px: int = Field(default=0, ge=0, le=8192)  # side of the normal map; 0: none, since it shows grid cells
     correctives: int = Field(default=16, ge=0, le=64)  # blend shapes for what skinning leaves out; 0: none
     bones: Literal["along", "identity"] = "along"  # joint axes at rest: Y along the bone, or the stage's
@@ -312,8 +314,8 @@ class LimitSettings(Section):
     """Limits: how long a stage may make no progress before it is ended, and how much memory a recording's files may
     need while they are read. No result depends on them."""
 
-    stage_s: float = Field(default=1800.0, gt=0, le=1e8)  # a stage may make no progress for this long, plus
-    image_s: float = Field(default=5.0, ge=0, le=1e4)  # this for each image: frames times cameras
+    stage_s: float = Field(default=1800.0, gt=0, le=1e8)  # a stage without progress is ended after this, plus image_s
+    image_s: float = Field(default=5.0, ge=0, le=1e4)  # added to stage_s for each image (frames times cameras)
     reader_gib: float = Field(default=8.0, ge=1, le=1e6)  # of memory for the process that reads a recording's files
 
 

@@ -129,7 +129,7 @@ def _run(*command: str) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S)
     except FileNotFoundError:
-        raise InputError(f"{command[0]}: not installed, and networks come by it; install it and {ADVICE}") from None
+        raise InputError(f"{command[0]}: not installed, but needed for downloads; install it and {ADVICE}") from None
     except subprocess.TimeoutExpired:
         raise InputError(f"{' '.join(command[:3])}: took over {LIMIT_S:.0f} s; {ADVICE} again") from None
     except subprocess.CalledProcessError as error:
@@ -140,7 +140,7 @@ def _run(*command: str) -> None:
 def _only(folder: Path, pattern: str) -> Path:
     found = list(folder.glob(pattern))
     if len(found) != 1:
-        raise InputError(f"{folder}: the client left {len(found)} packages of one; {ADVICE} again")
+        raise InputError(f"{folder}: {len(found)} packages were downloaded, not one; {ADVICE} again")
     return found[0]
 
 

@@ -39,8 +39,8 @@ class Garbage:
 
 
 def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbage]:
-    """Return the artifacts that the `keep` newest results of no subject need, the remains of interrupted work, and what
-    cannot be found any more. Leave out what was used in the last `older_s` seconds, or is being worked on."""
+    """Return the artifacts that no subject needs for its `keep` newest results, the remains of interrupted work, and
+    what cannot be found any more. Leave out what was used in the last `older_s` seconds, or is being worked on."""
     needed = inventory.needed(keep)
     found = [
         Garbage(one.artifact.stage, one.artifact.root.name, (), one.size_bytes, one.used_s)

@@ -108,8 +108,8 @@ class Store:
     root: Path
 
     def exists(self) -> bool:
-        """Return whether anything was ever stored here. A folder without any of these subfolders is not a store; one
-        with cameras/ may be where `hnerf calibrate` was run."""
+        """Return whether anything was ever stored here: whether a subfolder exists that only a store has. A cameras/
+        does not count, since `hnerf calibrate` writes one, too."""
         return any((self.root / name).is_dir() for name in ("subjects", "ingested", "capture", "fetched", ".running"))
 
     def find(self, stage: str, key: str) -> Artifact | None:

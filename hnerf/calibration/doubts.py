@@ -105,7 +105,7 @@ def doubts_about_test_cameras(capture: Capture, points_m: np.ndarray) -> list[st
         if off > GROSS_SHARE:
             why = f"its keypoints lie {off:.0%} of the person's height from where the training cameras see them"
         elif np.isnan(off) and not _in_sight(camera, points_m):
-            why = "the person, where the training cameras see it, is not in its picture, or a dot"
+            why = "where the training cameras see the person, its images show nothing or a dot"
         else:
             continue
         lines.append(
@@ -180,7 +180,7 @@ def _worse(camera: str, shares: dict[str, float], undone: dict[str, float]) -> l
         return []
     return [
         f"camera {camera}: {share:.0%} of the keypoints lie on the person, {compared}: they were detected in other "
-        "pictures than it has; put its pictures right, or detect again in these"
+        "images; correct its images, or detect again in these"
     ]
 
 

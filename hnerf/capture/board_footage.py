@@ -295,7 +295,7 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
             continue
         files = safe_io.files_in(folder, "calibration", part, path.name, suffixes=safe_io.IMAGE_SUFFIXES)
         if not files:  # such as the CHARUCO/ that Caliscope leaves here
-            log.warning("%s: no JPEG or PNG images, and not read; of a camera, give such", path)
+            log.warning("%s: holds no JPEG or PNG images; ignored", path)
             continue
         found[name] = ImageFolder(path, safe_io.numbered(files, "images"))
     return found

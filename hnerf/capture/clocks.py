@@ -138,8 +138,8 @@ def warn_if_uneven(one: Footage) -> None:
     """Warn if the frames of a single video, which are treated as evenly spaced, are not."""
     if isinstance(one, Video) and one.times_s and (off_s := _unevenness_s(np.asarray(one.times_s))) > NOTICED_S:
         log.warning(
-            "%s: frames come up to %.1f s off an even rate, by which they count: motion is too fast or too slow in "
-            "places; convert it to a constant rate",
+            "%s: frames come up to %.1f s off an even rate, which is assumed, so motion is too fast or too slow in "
+            "places; convert the video to a constant rate",
             one.path,
             off_s,
         )

@@ -197,9 +197,9 @@ def recognise(folder: Path) -> Layout:
             f"{folder}` from footage of a board, or with --from person"
         )
     raise InputError(
-        f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/Calib*.toml), COLMAP "
-        "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy), "
-        f"PeopleSnapshot (camera.pkl) and videos ({', '.join(VIDEO_SUFFIXES)}); see docs/formats.md"
+        f"{folder}: is none of these: EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/Calib*.toml), "
+        "COLMAP (sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy), "
+        f"PeopleSnapshot (camera.pkl) or videos ({', '.join(VIDEO_SUFFIXES)}); see docs/formats.md"
     )
 
 

@@ -118,7 +118,9 @@ def _points(path: Path, triples: list[Any]) -> np.ndarray:
     try:
         points = np.array(triples, dtype=np.float64).reshape(len(triples), -1, 3)
     except (OverflowError, TypeError, ValueError):
-        raise InputError(f"{path}: keypoints are not triples of numbers, as many per person; detect again") from None
+        raise InputError(
+            f"{path}: keypoints are not triples of numbers, the same number per person; detect again"
+        ) from None
     if not np.isfinite(points).all():
         raise InputError(f"{path}: a keypoint is NaN or infinite; detect them again")
     points[..., 2] = points[..., 2].clip(0, 1)  # some detectors exceed 1, and COCO's own annotations reach 2

@@ -313,6 +313,6 @@ def test_a_damaged_recording_is_refused(
 
 def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    for name, why in (("empty", "none of EasyMocap"), ("absent", "no such folder")):
+    for name, why in (("empty", "none of these: EasyMocap"), ("absent", "no such folder")):
         message = rec.refusal(tmp_path / name, tmp_path / "out")
         assert why in message and len(message) < 400

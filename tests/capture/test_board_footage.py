@@ -194,7 +194,7 @@ def test_caliscopes_output_folder_next_to_the_footage_is_not_a_camera(
     (extrinsic / "CHARUCO" / "image_points.csv").write_text("sync_index,cam_id\n")
     footage = read_board_footage(tmp_path, "extrinsic")
     assert footage is not None and list(footage.corners_px) == ["cam_0"]
-    assert "CHARUCO: no JPEG or PNG images, and not read" in caplog.text
+    assert "CHARUCO: holds no JPEG or PNG images; ignored" in caplog.text
 
 
 def test_footage_of_different_lengths_is_refused(extrinsic: Path, tmp_path: Path) -> None:

@@ -179,7 +179,7 @@ def _best_offsets(a: _Path, b: _Path, f: np.ndarray | None) -> np.ndarray:
             chosen.append(int(i))
     if not chosen:
         raise InputError(
-            f"the recordings do not show the person together for {MIN_OVERLAP_S:g} s; film longer, or leave it out"
+            f"the person is not seen in both recordings for {MIN_OVERLAP_S:g} s at once; film longer, or leave one out"
         )
     return np.asarray(lags[chosen] * step_s + grids[1][0] - grids[0][0])
 

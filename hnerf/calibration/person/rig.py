@@ -83,7 +83,7 @@ def _check_shared(cameras: Sequence[Camera], keypoints: np.ndarray) -> None:
         most = int(np.delete(shared[i], i).max())
         if most < MIN_SHARED:
             raise InputError(
-                f"camera {camera.name} shares {most} keypoints with any other, of the {MIN_SHARED} that it takes; let "
+                f"camera {camera.name} shares at most {most} keypoints with another one, and needs {MIN_SHARED}; let "
                 "two cameras see the person at once, or leave this one out"
             )
 

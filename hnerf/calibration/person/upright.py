@@ -28,8 +28,7 @@ def scale_to(cameras: Sequence[Camera], points: np.ndarray, height_m: float) -> 
     found = body_height_m(points)
     if not np.isfinite(found):
         raise InputError(
-            "legs, trunk or nose are never seen by two cameras at once, so that the height tells no scale; film the "
-            "whole person"
+            "legs, trunk or nose are never seen by two cameras at once, so the scale is unknown; film the whole person"
         )
     scale = height_m / found
     return [dataclasses.replace(camera, t_m=scale * camera.t_m) for camera in cameras], scale * points
@@ -99,8 +98,7 @@ def _body_direction(points_m: np.ndarray) -> np.ndarray:
     body_m = body_m[np.isfinite(body_m).all(-1)]
     if not len(body_m):
         raise InputError(
-            "ankles and neck are never seen by two cameras at once, so that nothing tells what is up; film the whole "
-            "person"
+            "ankles and neck are never seen by two cameras at once, so the vertical is unknown; film the whole person"
         )
     middle = np.median(body_m, axis=0)
     return middle / np.linalg.norm(middle)

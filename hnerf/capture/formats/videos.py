@@ -46,7 +46,7 @@ class Videos(EasyMocap):
         known = lens_by_angle(name, Video(video, (0,), None), stated)
         if not known.source:
             log.warning(
-                "%s: no calibration: a camera held level, whose longer side sees %.0f degrees, is assumed; if that is "
+                "%s: no calibration: assuming a level camera that sees %.0f degrees across its longer side; if that is "
                 "wrong, limbs are too deep or too flat: state field_of_view_deg in capture.toml%s",
                 self.folder,
                 np.rad2deg(2 * np.arctan(0.5 / USUAL_FOCAL)),

@@ -50,7 +50,7 @@ class ZjuMocap(Layout):
             ]
         except (IndexError, KeyError, TypeError, ValueError):
             raise InputError(
-                f"{self.source}: 'ims' does not list images by frame number, as many a frame; prepare it again"
+                f"{self.source}: 'ims' does not list images by frame number, equally many per frame; prepare it again"
             ) from None
         if strays:
             raise InputError(

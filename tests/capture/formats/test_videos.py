@@ -27,7 +27,7 @@ def test_a_single_video_is_a_capture(clip: Path, tmp_path: Path, caplog: pytest.
     with caplog.at_level(logging.WARNING):
         ingest(clip, SETTINGS, tmp_path / "out")
     found = Capture.load(tmp_path / "out")
-    assert "longer side sees 61 degrees, is assumed" in caplog.text
+    assert "assuming a level camera that sees 61 degrees across its longer side" in caplog.text
     assert "in capture.toml, in a folder with the video" in caplog.text  # files next to it are not read
     camera = found.cameras["my clip"]
     assert found.name == "my clip" and found.frames == (0, 1, 2, 3, 4, 5) and not found.has_keypoints
