@@ -10,7 +10,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("calibration", version="24")
+@stage("calibration", version="25")
 def calibrate(out: Path, recording: Artifact, settings: CalibrationSettings) -> dict[str, float]:
     """Check the cameras against the images, and write the cameras to be used by later stages."""
     report = check_calibration(Capture.load(recording.root), settings)

@@ -1,6 +1,7 @@
 """Check of the given cameras: errors that stop the run, measurements for the report, and refinement if needed."""
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 from itertools import combinations
 
@@ -34,6 +35,8 @@ from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
+log = logging.getLogger("hnerf.calibration")
+
 COINCIDENT_M = 0.005  # two cameras nearer to each other than this are one, given twice
 COMMON_HEIGHT_M = (1.4, 2.05)  # of adults; outside, the person is a child or the unit is wrong
 RESIDUAL_SHARE = 0.014  # of the person's height in pixels: 5 px of 357 px
@@ -48,7 +51,8 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     """
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
-    keypoints = ranked_people(capture)[0].keypoints
+    subject = ranked_people(capture)[0]
+    keypoints = subject.keypoints
     empty = [name for name, seen in zip(capture.train_cameras, keypoints, strict=True) if not seen[..., 2].any()]
     if empty:
         return _without(empty, capture, settings)
@@ -84,7 +88,8 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         raise InputError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
     held_out_px |= refinement.held_out_px
-    notes += [*refinement.notes, *_height_notes(after.body_height_m, capture.stature_m)]
+    notes += [*_side_notes(capture, subject.exchanged), *refinement.notes]
+    notes += _height_notes(after.body_height_m, capture.stature_m)
     return CalibrationReport(
         cameras=every,
         verdicts=verdicts,
@@ -161,6 +166,19 @@ def _check_height(capture: Capture, found: Measure) -> None:
     raise InputError(
         f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_unit_advice(factor)}"
     )
+
+
+def _side_notes(capture: Capture, exchanged: Sequence[int]) -> list[str]:
+    """Return a note on each camera with images in which left and right were exchanged, by their number, and log it."""
+    notes = [
+        f"camera {name}: left and right of arms, legs or ears were exchanged in {count} of {len(capture.frames)} "
+        "images, and are put right"
+        for name, count in zip(capture.train_cameras, exchanged, strict=False)
+        if count
+    ]
+    for note in notes:
+        log.warning("%s: %s", capture.name, note)
+    return notes
 
 
 def _height_notes(height_m: float, stature_m: float | None) -> list[str]:

@@ -25,11 +25,13 @@ STILL_SHARE = 0.05  # of a person's height: a picture of a person moves less (de
 class PersonTrack(NamedTuple):
     """A person followed through a recording. keypoints (C, frames, 25, 3), 0 where not seen; claim, in [0, 1]: the mean
     over cameras and frames of size x confidence x centrality x agreement of the cameras; moves: whether any part of the
-    person does, unlike a picture on a wall."""
+    person does, unlike a picture on a wall; exchanged: in how many images of each camera the subject's left and right
+    were exchanged, empty if that was not checked."""
 
     keypoints: np.ndarray
     claim: float
     moves: bool
+    exchanged: tuple[int, ...] = ()
 
 
 def follow_in_each_camera(cameras: list[Camera], people: list[np.ndarray]) -> list[PersonTrack]:

@@ -7,8 +7,9 @@ from hnerf.capture.body_25 import Body25
 from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.lens import distort_points
 from hnerf.capture.people import PersonTrack, follow_in_each_camera, follow_people, moves
+from hnerf.capture.sides import put_sides_right
 from hnerf.errors import InputError
-from hnerf.geometry.camera import resampling
+from hnerf.geometry.camera import Camera, resampling
 from hnerf.geometry.triangulation import triangulate
 
 EQUAL_CLAIM = 0.9  # share of the best claim above which another person could equally be meant
@@ -25,20 +26,28 @@ def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
 
 
 def ranked_people(capture: Capture) -> list[PersonTrack]:
-    """Return the people in the training cameras, the subject first.
+    """Return the people in the training cameras, the subject first, with left and right as most cameras see them.
 
     The subject is the person that `capture.subject_point` names, else the one with the best claim
     (`hnerf.capture.people`) among those who move: a poster does not. Raises InputError if no frame shows a person in
     two cameras (in one, if there is only one), nobody is where the point is, or two people have an equal claim. Cameras
     that are all at one position are not calibrated yet; then each chooses separately.
     """
-    people = _detected(capture)
+    people, cameras = _detected(capture), [capture.cameras[name] for name in capture.train_cameras]
+    centres_m = np.stack([camera.centre_m for camera in cameras])
+    uncalibrated = len(cameras) > 1 and bool((centres_m == centres_m[0]).all())
+    subject, *others = _ranked(capture, cameras, people, uncalibrated)
+    if len(cameras) > 1 and not uncalibrated:
+        keypoints, exchanged = put_sides_right(cameras, subject.keypoints)
+        subject = subject._replace(keypoints=keypoints, exchanged=tuple(exchanged.sum(1).tolist()))
+    return [subject, *others]
+
+
+def _ranked(capture: Capture, cameras: list[Camera], people: list[np.ndarray], uncalibrated: bool) -> list[PersonTrack]:
+    """Return what `ranked_people` does, with left and right as detected. people: those in each camera."""
     if all(found.shape[1] == 1 for found in people):
         alone = np.stack([found[:, 0] for found in people])
         return [PersonTrack(alone, 1.0, moves(alone))]
-    cameras = [capture.cameras[name] for name in capture.train_cameras]
-    centres_m = np.stack([camera.centre_m for camera in cameras])
-    uncalibrated = len(cameras) > 1 and bool((centres_m == centres_m[0]).all())
     tracks = (follow_in_each_camera if uncalibrated else follow_people)(cameras, people)
     if not tracks:
         raise InputError(f"{capture.name}: no person found in any frame; check the keypoint files")

@@ -19,6 +19,7 @@ from hnerf.calibration.diagnosis import (
     trimmed_cost_px,
 )
 from hnerf.capture.capture import Capture
+from hnerf.capture.sides import PARTS
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -199,6 +200,19 @@ def test_rounding_is_not_reported_as_a_change_of_focal_length(zoom: float, lens:
 def test_a_camera_turned_by_ten_degrees_is_recovered(tmp_path: Path) -> None:
     report = check_calibration(recorded_with(tmp_path, lambda c: turned(c, 10.0), only=1), SETTINGS)
     assert true_error_px(report.cameras["c1"], ring(4)[1]) < 1
+
+
+def test_a_camera_that_exchanges_left_and_right_is_used_and_named(tmp_path: Path) -> None:
+    """Its keypoints would be off by a tenth of the person's height in the mean, and its calibration to blame."""
+    seen = detections(ring(4), 1)
+    for part in PARTS:
+        for right, left in part:
+            seen[3][:, [right, left]] = seen[3][:, [left, right]]
+    report = check_calibration(write_capture(tmp_path, ring(4), seen), SETTINGS)
+    assert [verdict.status for verdict in report.verdicts.values()] == ["ok"] * 4
+    assert report.notes[0] == (
+        "camera c3: left and right of arms, legs or ears were exchanged in 12 of 12 images, and are put right"
+    )
 
 
 def test_when_all_cameras_are_refined_the_world_stays_in_place(tmp_path: Path) -> None:

@@ -260,7 +260,7 @@ def test_cameras_in_one_line_cannot_find_the_focal_length(count: int, tmp_path: 
 def test_too_few_shared_keypoints_are_refused(tmp_path: Path) -> None:
     seen = detections(ring(3), 1.0)
     seen[2, 2:, :, 2] = 0
-    assert "camera c2 shares 50 keypoints" in refusal(tmp_path, ring(3), seen, [])
+    assert "camera c2 shares at most 50 keypoints" in refusal(tmp_path, ring(3), seen, [])
 
 
 def test_recordings_of_different_times_are_refused(tmp_path: Path) -> None:
