@@ -121,7 +121,6 @@ def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[s
     align = f"poses align to {_mm(ALIGNMENT_M)}" if posed else "there is one posture"
     finest = f"a pixel covers {_mm(scene.footprint_m)}, {align}: cells of {_mm(cell_m)}"
     outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
-    outer_m, inner_m = given.outer_m or outer_m, given.inner_m or inner_m
     nearly_static = scene.std_rad < MIN_POSE_STD_RAD
     colour_cells = given.colour_cells or _level_cells(COARSEST_CELLS["colour"], scene.side_m / cell_m, COLOUR_LEVELS)
     return {

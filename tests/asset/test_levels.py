@@ -86,3 +86,13 @@ def test_faces_that_expressions_move_are_decimated_least() -> None:
     here, there = kept({"smile": moved_m})
     assert here > 2 * there
     assert kept({"smile": moved_m + 0.01}) == kept({})
+
+
+def test_what_any_expression_moves_is_decimated_least() -> None:
+    """As above, with a second expression that moves nothing by more than 1 mm."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    right = ball.vertices[:, 0] > 0
+    layout = UvLayout(ball.vertices[:, :2].astype(np.float32), np.array(ball.faces))
+    moved_m = np.where(right, 0.003, 0.001)[:, None] * [0.0, 0, 1]
+    vertices = levels_of(ball.vertices, ball.faces, layout, [300], {"smile": moved_m, "blink": moved_m / 3})[1].vertices
+    assert right[vertices].sum() > 2 * (~right)[vertices].sum()

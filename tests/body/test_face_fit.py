@@ -207,3 +207,11 @@ def photograph(body: BodyFit, camera: Camera, frame: int) -> np.ndarray:
     picture = np.full((len(hits.face), 3), 127, np.uint8)
     picture[hits.face >= 0] = (0.4 + 0.6 * lit)[:, None] * (200, 150, 120)
     return picture.reshape(camera.height_px, camera.width_px, 3)
+
+
+def test_a_head_that_the_border_cuts_in_half_is_not_looked_at(tmp_path: Path) -> None:
+    body, camera = moving_body((0,)), ring_camera("0", -0.97)
+    capture = record(tmp_path, body, {"0": camera}, ("0",))
+    (photo,) = photographs_of_face(capture, body)
+    at_border = dataclasses.replace(camera, K=camera.K - np.outer([0, photo.region.centre_px[1], 0], [0, 0, 1]))
+    assert photographs_of_face(dataclasses.replace(capture, cameras={"0": at_border}), body) == []

@@ -86,3 +86,14 @@ def test_the_view_direction_uses_only_visible_keypoints(tmp_path: Path) -> None:
     assert depths is not None
     middle_px = observations.pixels[0, 0, [2, 5]].mean(0).numpy()
     np.testing.assert_allclose(depths.away[0], camera.rays(middle_px)[1], rtol=1e-6)
+
+
+def test_several_cameras_see_depth_themselves(tmp_path: Path) -> None:
+    cameras = {name: ring_camera(name, angle) for name, angle in (("1", 0.4), ("2", 2.0))}
+    capture = record(tmp_path, moving_body((0,)), cameras, tuple(cameras))
+    (tmp_path / LANDMARKS).mkdir()
+    for name in cameras:
+        np.savez(
+            tmp_path / LANDMARKS / f"{name}.npz", points_px=np.zeros((1, 1, 33, 3)), points_m=np.zeros((1, 1, 33, 3))
+        )
+    assert observe_limb_depths(capture, observe(capture)) is None

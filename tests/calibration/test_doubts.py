@@ -152,3 +152,9 @@ def test_a_test_camera_may_also_see_somebody_else_or_nobody(tmp_path: Path) -> N
     with edited_keypoints(tmp_path) as found:
         found["c3"][:] = 0
     assert doubts_about_test_cameras(capture, points_m) == []
+
+
+def test_a_world_upside_down_is_doubted(tmp_path: Path) -> None:
+    capture = write_capture(tmp_path, ring(3), detections(ring(3), 1))
+    (doubt,) = doubts(capture, np.ones((3, FRAMES, 25, 3)), walk_m() * [1, -1, -1])
+    assert doubt.startswith("the trunk mostly points along -z, not up (+z)")

@@ -57,3 +57,9 @@ def test_views_a_right_angle_apart_share_no_matches(wave: Capture) -> None:
     found = Matches.of(wave)
     assert found.by_pair == {}
     assert found.residuals_px(list(wave.cameras.values())) == {}
+
+
+def test_matches_of_which_most_are_wrong_are_not_used() -> None:
+    """20 of 100 are right: enough in number, but less than 30 %."""
+    wrong = np.random.default_rng(1).uniform(0, 1000, (80, 2, 2))
+    assert len(_verified_matches(np.concatenate([seen(20), wrong]))) == 0

@@ -96,3 +96,13 @@ def test_the_rendered_performer_stands_on_the_ground(tmp_path_factory: pytest.Te
     name = capture.train_cameras[0]
     keypoints = subject_keypoints(capture)[name]
     assert stature_on_ground_m(capture.cameras[name], keypoints, capture.up) == pytest.approx(1.75, abs=0.2)
+
+
+def test_soles_give_the_stature_if_they_are_seen_in_most_frames() -> None:
+    """A toe stands on the ground in two of three frames; ankles are found in all of them, far too high."""
+    camera = look_at("0", np.array([4.0, 0, 1.0]), target_m=np.array([0, 0, 1.0]))
+    points_m = np.array([[0, 0, 1.84], [0, 0, 0.3], [0, 0, 0.3], [0, 0, 0]])
+    seen = np.zeros((3, 25, 3))
+    seen[:, [0, 11, 14, 19]] = np.column_stack([camera.project(points_m)[0], np.ones(4)])
+    seen[2, 19] = 0
+    assert stature_on_ground_m(camera, seen, "z") == pytest.approx(2.0)

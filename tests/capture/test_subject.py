@@ -11,7 +11,7 @@ from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.subject import ranked_people, subject_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
-from tests.calibration.synthetic import STANDING_M, detections, edited_keypoints, ring, walk_m, write_capture
+from tests.calibration.synthetic import STANDING_M, detections, edited_keypoints, ring, turned, walk_m, write_capture
 
 _AGREED = people._agreements
 FRAMES, CONFIDENCE, NOISE_PX = 30, 0.8, 1.0
@@ -257,3 +257,13 @@ def test_the_error_for_a_camera_without_keypoints_says_how_to_get_them(tmp_path:
         del kept["c1"]
     with pytest.raises(InputError, match=r"camera c1: no keypoints; set detection\.source=network, or detect some"):
         subject_keypoints(capture)
+
+
+def test_a_badly_calibrated_camera_keeps_its_detections_of_the_subject(tmp_path: Path) -> None:
+    """The third camera is calibrated 30 degrees off, so the others support none of its detections. A stranger walks by
+    farther away."""
+    cameras = ring(3)
+    capture, (subject, _) = recorded(tmp_path, cameras, walk_m(FRAMES), walking((-2.5, 2), (-2.5, -2)))
+    wrong = capture.with_cameras(capture.cameras | {"c2": turned(cameras[2], 30)})
+    found = subject_keypoints(wrong)
+    assert min(share_right({name: found[name]}, {name: subject[name]}) for name in found) > 0.9

@@ -4,7 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hnerf.capture.capture import Capture, write_image
+from hnerf.capture.capture import LANDMARKS, Capture, write_image
+from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.timing import nearest_frame, nearest_rows, resample
 from hnerf.geometry.camera import Camera
 
@@ -90,3 +91,21 @@ def test_a_synchronised_capture_reads_the_nearest_frames(tmp_path: Path, monkeyp
     assert json.loads((tmp_path / "capture.json").read_text())["frame_offsets"] == {"a": 1.75}
     again = Capture.load(tmp_path)
     assert (again.frame_offsets, again.stored_frames, again.frames) == ({"a": 1.75}, (0, 1, 2, 3, 4, 5), (0, 1, 2, 3))
+
+
+def test_poses_and_landmarks_of_a_synchronised_capture_stay_with_their_instants(tmp_path: Path) -> None:
+    """Camera a is two frames early, to the nearest frame: instants 2 to 5 are its frames 0 to 3. Poses are of
+    instants."""
+    camera, size = Camera("a", np.eye(3), np.eye(3), np.zeros(3), 4, 4), {"a": (4, 4)}
+    capture = Capture("x", tmp_path, {"a": camera}, ("a",), (), tuple(range(6)), (), 30.0, "z", size, size)
+    poses = GivenPoses.unknown(6)
+    poses.theta[:], poses.root[:] = 0, 0
+    poses.theta[:, 0, 0] = range(6)
+    poses.save(tmp_path / "poses.npz")
+    (tmp_path / LANDMARKS).mkdir()
+    np.savez(tmp_path / LANDMARKS / "a.npz", points_px=np.arange(6), points_m=np.arange(6) / 10)
+    shifted = capture.synchronised({"a": -1.75})
+    given, landmarks = shifted.given_poses(), shifted.landmarks("a")
+    assert shifted.frames == (2, 3, 4, 5)
+    assert given is not None and given.theta[:, 0, 0].tolist() == [2, 3, 4, 5]
+    assert landmarks is not None and [found.tolist() for found in landmarks] == [[0, 1, 2, 3], [0, 0.1, 0.2, 0.3]]

@@ -160,3 +160,25 @@ def test_a_person_whom_a_network_added_has_no_recorded_hands(tmp_path: Path) -> 
     np.savez(capture.root / "given_hands.npz", **{"01": np.ones((5, 1, 2, 21, 3))})
     found = given_hands(capture, "01", np.tile([12.0, 5, 0.5], (5, 25, 1)))
     assert found[:, 0, 0, 0].tolist() == [1, 1, 0, 1, 1]
+
+
+def test_a_hand_is_searched_for_again_around_where_it_was_found() -> None:
+    """The first region's side is 48 px, for a forearm of 40 px; the second's is twice the palm of 60 px."""
+    sides_px = []
+
+    def network(_: np.ndarray, region) -> np.ndarray:  # type: ignore[no-untyped-def]
+        sides_px.append(region.side_px)
+        return flat_hand((100, 205))
+
+    keypoints = person((100, 200), (300, 200))
+    keypoints[3, 2] = 0
+    find_hands(IMAGE, keypoints, network)  # type: ignore[arg-type]
+    assert sides_px == pytest.approx([48, 120])
+
+
+def test_half_of_a_hands_direction_is_from_the_knuckles_beside_the_middle_finger() -> None:
+    """The middle finger's knuckle is at (0, -40), the mean of its neighbours' at (40, -40): the hand points to (20,
+    -40), turned by atan(1 / 2)."""
+    points = flat_hand((0, 0))[:, :2]
+    points[[5, 13], 0] = 30, 50
+    assert hand_region(points).angle == pytest.approx(np.arctan(0.5))

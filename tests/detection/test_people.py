@@ -100,3 +100,11 @@ def test_a_person_who_is_always_cut_off_is_refused(capture: Capture) -> None:
     with pytest.raises(InputError, match="ring: the person is always cut off by the images' border; record"):
         check_subject(capture, track(left, right))
     check_subject(capture, track(left, standing(25)))
+
+
+def test_a_person_whom_one_camera_sees_whole_may_be_cut_off_in_another(tmp_path: Path) -> None:
+    cameras = [dataclasses.replace(camera, width_px=SIZE_PX, height_px=SIZE_PX) for camera in ring(2)]
+    capture = write_capture(tmp_path, cameras, np.zeros((2, 2, 25, 3)))
+    cut = standing(25)
+    cut[11] = 0
+    check_subject(capture, PersonTrack(np.stack([[cut, cut], [standing(25), standing(25)]]), 0.5, True))

@@ -75,3 +75,17 @@ def test_detection_runs_in_every_image_while_a_person_is_missing() -> None:
     scene, images = Scene(), [near, apart, near]
     counts = [len(people) for people in track(images, scene.detector, scene.landmarks)]
     assert counts == [2, 1, 2] and scene.detections == 3
+
+
+def test_landmarks_are_found_twice_for_a_person_of_another_size() -> None:
+    """The person fills a region of 130 px, where the detector's has 100: 1.3 times as large, at the same place."""
+    sides = []
+
+    def landmarks(image: np.ndarray, region: Region) -> Person:
+        sides.append(region.side_px)
+        return Person(
+            np.zeros((33, 3)), np.zeros((33, 3)), np.zeros((256, 256)), region, Region(np.zeros(2), 130.0, 0.0)
+        )
+
+    next(track([np.zeros((1, 2))], lambda _: [Region(np.zeros(2), 100.0, 0.0)], landmarks))
+    assert sides == [100, 130]

@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -133,3 +134,25 @@ def test_gaps_are_filled_by_frame_number_by_hand() -> None:
     tracks = np.full((4, 25, 2), np.nan)
     tracks[[0, 1, 3], 8] = [[0, 100], [10, 100], [110, 100]]
     assert _interpolated(tracks, (4, 5, 6, 15))[2, 8].tolist() == [20, 100]
+
+
+def test_person_masks_count_only_if_all_training_cameras_have_them(tmp_path: Path) -> None:
+    """As when only cameras without keypoints were searched."""
+    capture, truth = write_scene(tmp_path, 2)
+    write_likely(capture, {view: mask for view, mask in truth.items() if view[0] == "c0"})
+    assert not capture.has_person_masks
+    write_likely(capture, truth)
+    assert capture.has_person_masks
+
+
+def test_only_in_an_upright_image_nothing_is_expected_far_below_the_person(tmp_path: Path) -> None:
+    """A camera that is mounted upside down shows the same image: what is below in it is above in the world."""
+    capture, _ = write_scene(tmp_path)
+    camera = capture.cameras["c0"]
+    flipped = capture.with_cameras({"c0": dataclasses.replace(camera, R=np.diag([-1.0, -1, 1]) @ camera.R)})
+    upright, upside_down = (dict(camera_priors(c, None, SegmentationSettings()))["c0"](0) for c in (capture, flipped))
+    lowest, reached, below = (
+        int(np.flatnonzero(m.any(1))[-1]) for m in (upright.body, upright.reach, upside_down.reach)
+    )
+    assert reached == lowest + int(0.06 * upright.height_px)
+    assert below > lowest + 0.06 * upright.height_px + 5

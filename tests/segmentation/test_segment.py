@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from hnerf.capture.capture import Capture, read_rgb, write_image
+from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.masks import Masks, encode, movement_px
 from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
@@ -293,3 +294,29 @@ def test_rendered_capture_against_ground_truth(wave: Capture, tmp_path: Path) ->
     for camera, frame in product(capture.train_cameras, capture.frames):
         truth = cv2.imread(str(folder / "ground_truth" / "masks" / camera / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE)
         assert iou(masks.get(camera, frame), truth > 127) > 0.95
+
+
+@pytest.mark.parametrize("known_by", ["plate", "pose"])
+def test_a_person_who_is_not_detected_keeps_the_mask_by_a_plate_or_a_given_pose(tmp_path: Path, known_by: str) -> None:
+    """Nobody is detected in frame 4, which shows the person all the same."""
+    capture, truth = write_scene(tmp_path, cameras=2, moves_m=0.1)
+    with edited_keypoints(tmp_path) as found:
+        for keypoints in found.values():
+            keypoints[4] = 0
+    write_likely(capture, truth)
+    if known_by == "pose":
+        shutil.rmtree(tmp_path / "background")
+        poses = GivenPoses.unknown(len(capture.frames))
+        poses.theta[:], poses.root[:] = 0, 0
+        poses.save(tmp_path / "poses.npz")
+    assert segment(capture, None, SETTINGS).encoded.keys() == truth.keys()
+
+
+def test_a_mask_whose_area_jumps_is_dropped(tmp_path: Path) -> None:
+    """In frame 4 the mask is 6 px wider on all sides, in the others it is right."""
+    capture, truth = write_scene(tmp_path)
+    leak = cv2.dilate(truth["c0", 4].astype(np.uint8), np.ones((13, 13), np.uint8)).astype(bool)
+    write_masks(capture, truth | {("c0", 4): leak})
+    masks = segment(capture, None, SETTINGS)
+    (row,) = masks.report["cameras"]["c0"]["dropped"]
+    assert row["frame"] == 4 and row["reason"].startswith("area jumps from ") and ("c0", 4) not in masks

@@ -70,3 +70,10 @@ def test_a_mask_is_compared_with_near_frames_only() -> None:
 
     assert area_jumps(Frames(range(300)), [MaskVerdict(None, None, 1000)] * 300, [1000] * 300) == {}
     assert len(looked_at) < 20 * 300  # not 300 * 300
+
+
+def test_a_mask_that_touches_all_sides_is_inverted_only_if_it_covers_most_of_the_image() -> None:
+    """A person in close-up, whom no keypoint shows: a cross of 39 of 400 pixels."""
+    cross, nothing = np.zeros((2, 20, 20), bool)
+    cross[10], cross[:, 10] = True, True
+    assert judge_mask(cross, Prior(nothing, nothing, nothing, nothing, 0.0)).fault is None

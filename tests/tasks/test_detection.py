@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, DetectionSettings, SegmentationSettings
 from hnerf.models import HAND_LANDMARKS, POSE_DETECTOR
@@ -14,7 +15,7 @@ from tasks.detection import needs_detection, needs_hands
 from tasks.segmentation import needs_body
 from tasks.store import Artifact
 from tests.capture.recordings import write_easymocap
-from tests.segmentation.scene import write_likely, write_scene
+from tests.segmentation.scene import write_likely, write_masks, write_scene
 
 
 @pytest.mark.parametrize(
@@ -76,3 +77,33 @@ def test_hand_detection_needs_hands_or_a_network_keypoints_two_cameras_and_the_s
     capture.save()
     (tmp_path / "capture" / "keypoints.npz").unlink()
     assert not needs_hands(recording, DetectionSettings())
+
+
+def test_given_poses_take_the_place_of_detection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a pose for every frame, neither a single camera nor missing keypoints need the network."""
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path))
+    (tmp_path / POSE_DETECTOR).touch()
+    capture = ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
+    dataclasses.replace(capture, train_cameras=capture.train_cameras[:1]).save()
+    recording = Artifact(stage="capture", root=capture.root, files={})
+    poses = GivenPoses.unknown(len(capture.frames))
+    poses.theta[:], poses.root[:] = 0, 0
+    poses.save(capture.root / "poses.npz")
+    assert not needs_detection(recording, DetectionSettings())
+    (capture.root / "keypoints.npz").unlink()
+    assert not needs_detection(recording, DetectionSettings())
+    assert needs_detection(recording, DetectionSettings(source="both"))
+
+
+def test_a_rough_fit_is_needed_if_one_camera_lacks_mask_and_plate_or_without_keypoints(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path, 2)
+    capture.save()
+    recording, settings = Artifact(stage="capture", root=capture.root, files={}), SegmentationSettings()
+    assert not needs_body(recording, settings)
+    (tmp_path / "background" / "c1.png").unlink()
+    assert needs_body(recording, settings)
+    assert not needs_body(recording, SegmentationSettings(model=tmp_path / "seg.onnx"))
+    write_masks(capture, {view: mask for view, mask in truth.items() if view[0] == "c1"})
+    assert not needs_body(recording, settings)
+    (tmp_path / "keypoints.npz").unlink()
+    assert needs_body(recording, settings)

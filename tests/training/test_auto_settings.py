@@ -193,3 +193,10 @@ def test_masks_are_not_measured_where_the_image_has_no_outline_of_the_body(tmp_p
     seen = Masks(masks.encoded | {("0", 0): encode(mask)}, {})
     scene = SceneStatistics.of(alone, seen, body)
     assert max(scene.outside_m, scene.inside_m) < 1
+
+
+def test_the_ground_is_judged_by_training_frames_only(tmp_path: Path) -> None:
+    """In the novel frame, the third, the body is a metre lower."""
+    capture, masks, body = record(tmp_path)
+    body.root[2, 2, 3] -= 1
+    assert SceneStatistics.of(capture, masks, body).lowest_m == pytest.approx((0.0, 0.0), abs=1e-6)
