@@ -368,6 +368,7 @@ FAULTS = (
     Fault("root-heading", "asset/motions", "2 * np.arctan2(y, w)", "np.arctan2(y, w)"),
     Fault("root-upside-down", "asset/motions", "if known.any():", "if False:"),
     Fault("slerp-share", "asset/motions", "np.repeat(share, joints)", "np.tile(share, joints)", "asset/package"),
+    Fault("resampled-gap", "asset/motions", "np.floor(share + 1e-6)", "share"),
     Fault("resampled-start", "asset/motions", "np.ceil(first - 1e-6)", "np.floor(first)"),
     Fault("bones-front", "asset/skeleton", "UP if _points_to_front(name) else FRONT",
           "FRONT if _points_to_front(name) else UP"),

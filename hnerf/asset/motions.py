@@ -10,6 +10,7 @@ from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 from hnerf.geometry.rotations import slerp
 
+LONGEST_S = 0.7  # between poses farther apart, what happened is a guess
 LEAST_TWIST = 0.5  # length of a quaternion's twist part: cos(60), when the up axis swings by 120 degrees
 
 
@@ -61,7 +62,8 @@ def motion_of(body: BodyFit, fps: float, shape_weights: np.ndarray, stage_from_w
 def resampled(motion: Motion, fps: float) -> Motion:
     """Return the motion at all whole time codes of another rate within its range; if there is none, at the nearest.
 
-    Rotations are interpolated at constant angular velocity, positions and weights linearly.
+    Rotations are interpolated at constant angular velocity, positions and weights linearly. Between poses more than
+    LONGEST_S apart, the earlier one is held.
     """
     first, last = motion.seconds[[0, -1]] * fps
     codes = np.arange(int(np.ceil(first - 1e-6)), int(np.floor(last + 1e-6)) + 1).astype(float)
@@ -71,6 +73,7 @@ def resampled(motion: Motion, fps: float) -> Motion:
     after = np.minimum(before + 1, len(motion.codes) - 1)
     span_s = np.maximum(motion.seconds[after] - motion.seconds[before], 1e-9)
     share = (at_s - motion.seconds[before]) / span_s
+    share = np.where(span_s > LONGEST_S + 1e-6, np.floor(share + 1e-6), share)
     n, joints = len(codes), motion.turns.shape[1]
     start, end = (Rotation.from_matrix(motion.turns[rows].reshape(-1, 3, 3)) for rows in (before, after))
     turns = slerp(start, end, np.repeat(share, joints)).as_matrix().reshape(n, joints, 3, 3)

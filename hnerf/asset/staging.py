@@ -9,7 +9,7 @@ import numpy as np
 from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import Correctives
 from hnerf.asset.levels import Level, levels_of
-from hnerf.asset.motions import Motion, motion_of, resampled
+from hnerf.asset.motions import LONGEST_S, Motion, motion_of, resampled
 from hnerf.asset.rigs import FULL, RestSurface, StagedRig, stage_rigs
 from hnerf.asset.skeleton import Bones
 from hnerf.asset.texture import UvLayout
@@ -22,7 +22,6 @@ from hnerf.progress import tracked
 
 CAPTURED = "captured"  # the motion at the capture's own rate, whose time codes are the capture's frames
 RATES = (24, 30)  # frames a second at which it is resampled, since many importers ignore a file's rate
-MOST_PER_POSE = 20  # resampled frames: of poses 0.7 s apart, what lies between is a guess, which takes time and space
 STILL_M = 1e-5  # points that a blend shape moves by less count as unmoved
 REST_POSE = "A"  # of every body model here: arms slanting down
 
@@ -197,11 +196,12 @@ def opengl_pose(camera: Camera, stage_from_world: np.ndarray) -> np.ndarray:
 def _motions(
     clothed: BodyFit, fps: float, weights: np.ndarray, further: Mapping[str, tuple[BodyFit, float]], world: np.ndarray
 ) -> dict[str, Motion]:
-    """Return the captured motion first, then the same motion at other rates unless its poses are too far apart, then
-    further ones, which have no blend shapes and begin at the captured motion's first instant."""
+    """Return the captured motion first, then the same motion at other rates unless its poses are more than LONGEST_S
+    apart on average, then further ones, which have no blend shapes and begin at the captured motion's first
+    instant."""
     captured = motion_of(clothed, fps, weights, world)
     motions = {CAPTURED: captured}
-    if RATES[-1] * np.ptp(captured.seconds) <= MOST_PER_POSE * len(captured.codes):
+    if np.ptp(captured.seconds) <= LONGEST_S * (len(captured.codes) - 1) + 1e-6:
         motions |= {f"{CAPTURED}_{rate}": resampled(captured, rate) for rate in RATES}
     for name, (body, rate) in further.items():
         motion = motion_of(body, rate, np.zeros((len(body.frames), weights.shape[1]), np.float32), world)

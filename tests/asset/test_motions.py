@@ -30,6 +30,16 @@ def test_resampling_stays_within_the_motions_time_range() -> None:
     np.testing.assert_array_equal(resampled(turning(50.0, [14, 21], [0, 7]), 24).codes, [7, 8, 9, 10])
 
 
+def test_poses_are_held_across_long_gaps() -> None:
+    """From 0.7 to 1.5 s, codes 16.8 to 36 at 24 a second, the first of two poses is held. Before, there are 100 degrees
+    a second, 50 in 12 codes; after, 120 in 0.1 s, 50 a code. The last pose may stand alone, too."""
+    found = resampled(turning(10.0, [0, 7, 15, 16], [0, 70, 200, 320]), 24).origins_m[:, 1]
+    np.testing.assert_allclose(found[[0, 12, 16]], [0, 50, 200 / 3])
+    np.testing.assert_array_equal(found[17:36], 70)
+    np.testing.assert_allclose(found[36:], [200, 250, 300])
+    np.testing.assert_array_equal(resampled(turning(10.0, [0, 20], [0, 90]), 10).origins_m[:, 1], 20 * [0] + [90])
+
+
 def test_a_single_pose_is_one_frame() -> None:
     found = resampled(turning(10.0, [3], [20]), 24)  # code 7.2 at 24 a second
     np.testing.assert_array_equal(found.codes, [7])
