@@ -386,6 +386,7 @@ FAULTS = (
     Fault("package-extents", "asset/package", "for boxes in avatar.extents_m.values()", "for boxes in ()"),
     Fault("correctives-sign", "asset/correctives", "np.vstack([shapes_m, -shapes_m", "np.vstack([shapes_m, shapes_m"),
     Fault("bvh-count", "body/bvh", "if frames * max(width, 3 * len(joints)) > MAX_NUMBERS:", "if False:"),
+    Fault("bvh-jumps", "body/bvh", "angles[k] * (1, -1, 1) + 180", "angles[k]"),
     Fault("bvh-order", "body/bvh", "Rotation.from_euler(order, angles", "Rotation.from_euler(order.lower(), angles"),
     Fault("bvh-rest", "render/bvh_motion", "align_vectors(theirs[None], ours[None])",
           "align_vectors(ours[None], theirs[None])"),

@@ -20,8 +20,8 @@ MAX_NUMBERS = 20_000_000  # in all frames together
 MAX_VALUE = 1e6  # of an offset or a channel
 FRAME_S = (1e-4, 10.0)  # shortest and longest duration of a frame
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-# Rotation orders: the middle angle must stay within 90 degrees, beyond which all three flip. Roots turn about Y without
-# limit, limbs bend about X and rise about Z.
+# Rotation orders: while the middle angle is near 90 degrees, small turns change the outer two a lot. Roots turn about Y
+# without limit, limbs bend about X and rise about Z.
 ROOT_ORDER, JOINT_ORDER = "YZX", "XYZ"
 
 
@@ -93,9 +93,22 @@ def write_bvh(path: Path, motion: Bvh, ends: np.ndarray) -> None:
         Rotation.from_matrix(motion.rotations[:, joint]).as_euler(_written_order(joint), degrees=True)
         for joint in _depth_first(motion.parents)
     ]
-    for row in np.concatenate([motion.positions[:, 0], np.unwrap(np.hstack(turns), axis=0, period=360)], 1):
+    angles = _without_jumps(np.stack(turns, 1)).reshape(len(motion.positions), -1)
+    for row in np.concatenate([motion.positions[:, 0], angles], 1):
         lines.append(" ".join(f"{value:.6f}" for value in row))
     path.write_text("\n".join(lines) + "\n")
+
+
+def _without_jumps(angles: np.ndarray) -> np.ndarray:
+    """Return Euler angles (n, J, 3) in degrees of the same rotations, so that programs can interpolate between frames.
+    (a, b, c) and (a + 180, 180 - b, c + 180) are one rotation: take the one that is nearer to the frame before."""
+    found = angles.copy()
+    for k in range(1, len(found)):
+        both = np.stack([angles[k], angles[k] * (1, -1, 1) + 180])
+        both += 360 * np.round((found[k - 1] - both) / 360)
+        away = ((both - found[k - 1]) ** 2).sum(-1)
+        found[k] = np.where((away[0] <= away[1])[:, None], *both)
+    return found
 
 
 def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:

@@ -77,6 +77,25 @@ def test_written_angles_do_not_jump_at_180_or_90_degrees(tmp_path: Path) -> None
     np.testing.assert_allclose(read_bvh(tmp_path / "b.bvh").rotations, leg.rotations, atol=1e-6)
 
 
+@pytest.mark.parametrize("raised_deg", [0, 20])
+def test_curves_of_an_arm_that_swings_past_the_front_can_be_interpolated(raised_deg: int, tmp_path: Path) -> None:
+    """The arm is raised about Z and swings about Y, the middle one of its angles, by 10 degrees a frame and past 90.
+    X stays 0 and Z as raised, so that half-way between frames the angles' means have Y turned by 5 degrees more."""
+
+    def swung(degrees: np.ndarray) -> Rotation:
+        raised = Rotation.from_euler("z", raised_deg, degrees=True)
+        return Rotation.from_euler("y", degrees[:, None], degrees=True) * raised
+
+    degrees, at, turns = np.arange(54.0, 135, 10), np.zeros((9, 2, 3)), np.tile(np.eye(3), (9, 2, 1, 1))
+    turns[:, 1] = swung(degrees).as_matrix()
+    write_bvh(tmp_path / "b.bvh", Bvh(("hip", "arm"), np.array([-1, 0]), at[0], 0.1, at, turns), at[0])
+    np.testing.assert_allclose(read_bvh(tmp_path / "b.bvh").rotations, turns, atol=1e-6)
+    arm = np.loadtxt((tmp_path / "b.bvh").read_text().splitlines()[-9:])[:, 6:]
+    np.testing.assert_allclose(arm, degrees[:, None] * [0, 1, 0] + [0, 0, raised_deg], atol=1e-5)
+    halfway = Rotation.from_euler("XYZ", (arm[1:] + arm[:-1]) / 2, degrees=True)
+    assert (halfway.inv() * swung(degrees[1:] - 5)).magnitude().max() < np.radians(0.1)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
