@@ -5,23 +5,23 @@ from pathlib import Path
 
 import numpy as np
 
+from hnerf.asset.motions import Motion, resampled
 from hnerf.asset.rigs import GAME
 from hnerf.asset.skeleton import FRONT
 from hnerf.asset.skinning import Skin
-from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
+from hnerf.asset.staging import CAPTURED, StagedAvatar
 from hnerf.body.bvh import Bvh, write_bvh
 from hnerf.body.skeletons import OWN, name_in
 
 CENTIMETRES = 100  # per metre; MotionBuilder and Maya read BVH files in centimetres
-RATE = RATES[-1]
 SURROUNDED = 0.2  # points whose mean is nearer to their joint than this share of the farthest one's distance
 
 
 def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
-    """Write the captured motion of the game skeleton, from the pelvis down, at 30 frames per second, in centimetres, Y
-    up."""
+    """Write the captured motion of the game skeleton, from the pelvis down, in every frame of the capture from the
+    first pose to the last, in centimetres, Y up."""
     rig = avatar.rigs[GAME]
-    skeleton, stage = rig.skeleton, rig.stage(f"{CAPTURED}_{RATE}")[:, 1:]
+    skeleton, poses, stage = rig.skeleton, rig.motions[CAPTURED], rig.stage(CAPTURED)[:, 1:]
     # Relative to rest, where BVH's joints have no rotation.
     turned = stage[..., :3, :3] @ skeleton.rotations[1:].swapaxes(1, 2)
     parents = skeleton.parents[1:] - 1
@@ -29,13 +29,15 @@ def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
     local[:, 1:] = turned[:, parents[1:]].swapaxes(2, 3) @ turned[:, 1:]
     offsets[1:] -= CENTIMETRES * skeleton.positions_m[1:][parents[1:]]
     offsets[0] = 0  # some programs add the root's offset to its position channels, others ignore it
-    positions = np.tile(offsets, (len(stage), 1, 1))
-    positions[:, 0] = CENTIMETRES * stage[:, 0, :3, 3]
+    captured = Motion(poses.fps, poses.codes, local, stage[:, 0, :3, 3], poses.shape_weights)
+    motion = resampled(captured, poses.fps)
+    positions = np.tile(offsets, (len(motion.codes), 1, 1))
+    positions[:, 0] = CENTIMETRES * motion.origins_m
     own = avatar.joint_names == OWN
     named_as = "mixamo" if own else avatar.joint_names
     names = tuple(name_in(named_as, name, prefixed=not own) for name in skeleton.names[1:])
     ends = CENTIMETRES * tips_m(skeleton.positions_m, rig.skin, avatar.rest_points_m)[1:]
-    write_bvh(path, Bvh(names, parents, offsets, 1 / RATE, positions, local), ends)
+    write_bvh(path, Bvh(names, parents, offsets, 1 / motion.fps, positions, motion.turns), ends)
 
 
 def tips_m(joints_m: np.ndarray, skin: Skin, points_m: np.ndarray) -> np.ndarray:
