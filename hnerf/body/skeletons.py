@@ -2,7 +2,8 @@
 
 Exported names are those common in the field, with `_L` and `_R` so that Blender can mirror them. Other skeletons:
 Unreal Engine 5 (Manny), Mixamo (its prefix "mixamorig:" left out), HumanIK (Maya, MotionBuilder), VRM 1.0 humanoid,
-SMPL-X (joint names of its package), and CMU's motion capture database as it is found in BVH files.
+SMPL-X (joint names of its package), and those of recordings in BVH files: CMU's motion capture database, Biovision
+(as Xsens writes it), and SMPL.
 """
 
 import re
@@ -42,6 +43,8 @@ class Names(NamedTuple):
     vrm: str = ""
     smplx: str = ""
     cmu: str = ""
+    biovision: str = ""
+    smpl: str = ""
 
 
 SKELETONS = Names._fields
@@ -60,23 +63,29 @@ def is_serial(joint: str) -> bool:
 
 
 def _sided() -> dict[str, Names]:
-    """Return the names of the joints that come in pairs, with {Side}, {side} and {s} in place of Left, left and l."""
+    """Return the names of the joints that come in pairs, with {Side}, {side}, {S} and {s} in place of Left, left, L and
+    l."""
     one = {
         "clavicle": Names("clavicle_{s}", "{Side}Shoulder", "{Side}Shoulder", "{side}Shoulder", "{side}_collar",
-                          "{Side}Shoulder"),
-        "upperarm": Names("upperarm_{s}", "{Side}Arm", "{Side}Arm", "{side}UpperArm", "{side}_shoulder", "{Side}Arm"),
+                          "{Side}Shoulder", "{Side}Collar", "{S}_Collar"),
+        "upperarm": Names("upperarm_{s}", "{Side}Arm", "{Side}Arm", "{side}UpperArm", "{side}_shoulder",
+                          "{Side}Arm", "{Side}Shoulder", "{S}_Shoulder"),
         "upperarm_twist": Names("upperarm_twist_01_{s}", "", "Leaf{Side}ArmRoll1"),
         "forearm": Names("lowerarm_{s}", "{Side}ForeArm", "{Side}ForeArm", "{side}LowerArm", "{side}_elbow",
-                         "{Side}ForeArm"),
+                         "{Side}ForeArm", "{Side}Elbow", "{S}_Elbow"),
         "forearm_twist": Names("lowerarm_twist_01_{s}", "", "Leaf{Side}ForeArmRoll1"),
-        "hand": Names("hand_{s}", "{Side}Hand", "{Side}Hand", "{side}Hand", "{side}_wrist", "{Side}Hand"),
-        "thigh": Names("thigh_{s}", "{Side}UpLeg", "{Side}UpLeg", "{side}UpperLeg", "{side}_hip", "{Side}UpLeg"),
+        "hand": Names("hand_{s}", "{Side}Hand", "{Side}Hand", "{side}Hand", "{side}_wrist",
+                      "{Side}Hand", "{Side}Wrist", "{S}_Wrist"),
+        "thigh": Names("thigh_{s}", "{Side}UpLeg", "{Side}UpLeg", "{side}UpperLeg", "{side}_hip",
+                       "{Side}UpLeg", "{Side}Hip", "{S}_Hip"),
         "thigh_twist": Names("thigh_twist_01_{s}", "", "Leaf{Side}UpLegRoll1"),
-        "calf": Names("calf_{s}", "{Side}Leg", "{Side}Leg", "{side}LowerLeg", "{side}_knee", "{Side}Leg"),
+        "calf": Names("calf_{s}", "{Side}Leg", "{Side}Leg", "{side}LowerLeg", "{side}_knee",
+                      "{Side}Leg", "{Side}Knee", "{S}_Knee"),
         "calf_twist": Names("calf_twist_01_{s}", "", "Leaf{Side}LegRoll1"),
-        "foot": Names("foot_{s}", "{Side}Foot", "{Side}Foot", "{side}Foot", "{side}_ankle", "{Side}Foot"),
+        "foot": Names("foot_{s}", "{Side}Foot", "{Side}Foot", "{side}Foot", "{side}_ankle",
+                      "{Side}Foot", "{Side}Ankle", "{S}_Ankle"),
         "middle_toe_01": Names("ball_{s}", "{Side}ToeBase", "{Side}ToeBase", "{side}Toes", "{side}_foot",
-                               "{Side}ToeBase"),
+                               "{Side}ToeBase", "{Side}Toe", "{S}_Foot"),
         "eye": Names(vrm="{side}Eye", smplx="{side}_eye_smplhf"),
     }  # fmt: skip
     for finger in FINGERS:
@@ -93,22 +102,22 @@ def _sided() -> dict[str, Names]:
 
 
 def _of_side(names: Names, side: str) -> Names:
-    words = {"Side": side, "side": side.lower(), "s": side[0].lower()}
+    words = {"Side": side, "side": side.lower(), "S": side[0], "s": side[0].lower()}
     return Names(*(name.format(**words) for name in names))
 
 
 # By exported name.
 EQUIVALENTS: dict[str, Names] = {
     ROOT: Names("root", "", "Reference"),
-    PELVIS: Names("pelvis", "Hips", "Hips", "hips", "pelvis", "Hips"),
-    "spine_01": Names("spine_01", "Spine", "Spine", "spine", "spine1", "LowerBack"),
+    PELVIS: Names("pelvis", "Hips", "Hips", "hips", "pelvis", "Hips", "Hips", "Pelvis"),
+    "spine_01": Names("spine_01", "Spine", "Spine", "spine", "spine1", "LowerBack", "Chest", "Spine1"),
     "spine_02": Names("spine_02"),
-    "spine_03": Names("spine_03", "Spine1", "Spine1", "chest", "spine2", "Spine"),
+    "spine_03": Names("spine_03", "Spine1", "Spine1", "chest", "spine2", "Spine", "Chest2", "Spine2"),
     "spine_04": Names("spine_04"),
-    "spine_05": Names("spine_05", "Spine2", "Spine2", "upperChest", "spine3", "Spine1"),
-    "neck_01": Names("neck_01", "Neck", "Neck", "neck", "neck", "Neck1"),
+    "spine_05": Names("spine_05", "Spine2", "Spine2", "upperChest", "spine3", "Spine1", "Chest4", "Spine3"),
+    "neck_01": Names("neck_01", "Neck", "Neck", "neck", "neck", "Neck1", "Neck", "Neck"),
     "neck_02": Names("neck_02", "", "Neck1"),
-    "head": Names("head", "Head", "Head", "head", "head", "Head"),
+    "head": Names("head", "Head", "Head", "head", "head", "Head", "Head", "Head"),
     **{f"{joint}_{side[0]}": _of_side(names, side) for side in ("Left", "Right") for joint, names in _sided().items()},
 }
 

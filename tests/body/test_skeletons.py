@@ -44,6 +44,8 @@ def test_equivalent_names_in_other_skeletons() -> None:
     forearm = EQUIVALENTS["forearm_R"]
     assert (forearm.ue5, forearm.mixamo, forearm.humanik) == ("lowerarm_r", "RightForeArm", "RightForeArm")
     assert (forearm.vrm, forearm.smplx, forearm.cmu) == ("rightLowerArm", "right_elbow", "RightForeArm")
+    assert [EQUIVALENTS[joint].biovision for joint in ("clavicle_R", "upperarm_R")] == ["RightCollar", "RightShoulder"]
+    assert [EQUIVALENTS[joint].smpl for joint in ("foot_L", "middle_toe_01_L")] == ["L_Ankle", "L_Foot"]
     assert EQUIVALENTS["thumb_01_L"].vrm == "leftThumbMetacarpal"
     for skeleton in SKELETONS:
         theirs = [getattr(names, skeleton) for names in EQUIVALENTS.values() if getattr(names, skeleton)]
@@ -69,14 +71,15 @@ def test_names_in_other_skeletons_are_unique_in_any_letter_case(joints: tuple[st
 
 
 def test_exports_can_name_joints_after_each_skeleton_of_characters() -> None:
-    """CMU's is that of recordings."""
-    assert get_args(JointNames) == (OWN, *(name for name in SKELETONS if name != "cmu"))
+    """Three are those of recordings."""
+    assert (*get_args(JointNames), "cmu", "biovision", "smpl") == (OWN, *SKELETONS)
     assert get_args(AssetSettings.model_fields["joint_names"].annotation) == get_args(JointNames)
 
 
 def test_the_documented_table_of_joint_names_is_up_to_date() -> None:
     """The table lists the joints of the middle and of the left side."""
-    titles = ("exported", "Unreal Engine 5", "Mixamo", "HumanIK", "VRM", "SMPL-X", "CMU (BVH)")
+    heads = "exported|Unreal Engine 5|Mixamo|HumanIK|VRM|SMPL-X|CMU (BVH)|Biovision, Xsens (BVH)|SMPL (BVH)"
+    titles = heads.split("|")
     shown = ((joint, names) for joint, names in EQUIVALENTS.items() if not joint.endswith("_R"))
     rows = [titles, *((joint, *(getattr(names, s) for s in SKELETONS)) for joint, names in shown)]
     lines = [re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join(row)} |") for row in rows]

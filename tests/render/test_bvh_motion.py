@@ -10,7 +10,7 @@ from hnerf.body.anny import anny_model
 from hnerf.body.bvh import Bvh, write_bvh
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, joint_transforms
-from hnerf.body.skeletons import EQUIVALENTS, JointNames, exported_name, is_serial, name_in
+from hnerf.body.skeletons import EQUIVALENTS, SKELETONS, JointNames, exported_name, is_serial, name_in
 from hnerf.errors import InputError
 from hnerf.render.bvh_motion import joints_by_name, retargeted
 from hnerf.render.motion import read_motion
@@ -99,10 +99,7 @@ def test_a_rest_pose_may_face_any_direction_or_have_z_up(turned: Rotation, rig: 
     np.testing.assert_allclose(directions(rig, body, "thigh_L", "calf_L"), [[0, -1, 0]], atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("skeleton", "prefix"),
-    [("mixamo", "mixamorig:"), ("cmu", ""), ("ue5", ""), ("vrm", ""), ("smplx", ""), ("humanik", "")],
-)
+@pytest.mark.parametrize(("skeleton", "prefix"), [("mixamo", "mixamorig:"), *((name, "") for name in SKELETONS)])
 def test_joints_are_found_by_name(skeleton: str, prefix: str) -> None:
     file = t_pose(1, skeleton, prefix)
     assert joints_by_name(Path("a.bvh"), file.names) == {name: j for j, name in enumerate(T_POSE)}
