@@ -569,6 +569,7 @@ FAULTS = (
     Fault("lone-video-lens", "capture/formats/videos", "if self.folder.is_dir() and", "if False and"),
     Fault("truth-of-training", "evaluation/ground_truth", "for c in self.capture.test_cameras for",
           "for c in self.capture.cameras for", seen_by="evaluation/evaluate"),
+    Fault("trc-first", "asset/bvh_file", "(count, -1), first):", "(count, -1)):"),
     Fault("bvh-root", "asset/bvh_file", "    offsets[0] = 0", "    offsets[0] = offsets[0]"),
     Fault("garbage-damaged", "tasks/garbage", "record in lost or not", "not"),
     Fault("preset-empty", "config", "if not tree:", "if False:"),

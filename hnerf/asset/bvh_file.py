@@ -1,5 +1,5 @@
-"""The captured motion as a BVH file. Unless the asset names its joints after another skeleton, they have their Mixamo
-names, without the prefix, where Mixamo has an equivalent."""
+"""The captured motion as a BVH file, and the paths of its joints as a TRC file. Unless the asset names its joints after
+another skeleton, they have their Mixamo names, without the prefix, where Mixamo has an equivalent."""
 
 from pathlib import Path
 
@@ -18,7 +18,32 @@ SURROUNDED = 0.2  # points whose mean is nearer to their joint than this share o
 
 
 def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
-    """Write the captured motion of the game skeleton, from the pelvis down, in every frame of the capture from the
+    """Write the captured motion."""
+    rig = avatar.rigs[GAME]
+    ends = CENTIMETRES * tips_m(rig.skeleton.positions_m, rig.skin, avatar.rest_points_m)[1:]
+    write_bvh(path, captured_bvh(avatar), ends)
+
+
+def write_avatar_trc(path: Path, avatar: StagedAvatar) -> None:
+    """Write the paths of the joints of the BVH file, in metres, with the frame numbers and times of the capture."""
+    motion = captured_bvh(avatar)
+    at_m, fps = motion.world()[1] / CENTIMETRES, 1 / motion.frame_s
+    count, joints, first = len(at_m), len(motion.names), avatar.frames[0]
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{fps:.9g}\t{fps:.9g}\t{count}\t{joints}\tm\t{fps:.9g}\t{first}\t{count}",
+        "Frame#\tTime" + "".join(f"\t{name}\t\t" for name in motion.names),
+        "\t" + "".join(f"\tX{k}\tY{k}\tZ{k}" for k in range(1, joints + 1)),
+        "",
+    ]
+    for frame, row in enumerate(at_m.reshape(count, -1), first):
+        lines.append("\t".join([str(frame), *(f"{value:.6f}" for value in (frame / fps, *row))]))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def captured_bvh(avatar: StagedAvatar) -> Bvh:
+    """Return the captured motion of the game skeleton, from the pelvis down, in every frame of the capture from the
     first pose to the last, in centimetres, Y up."""
     rig = avatar.rigs[GAME]
     skeleton, poses, stage = rig.skeleton, rig.motions[CAPTURED], rig.stage(CAPTURED)[:, 1:]
@@ -36,8 +61,7 @@ def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
     own = avatar.joint_names == OWN
     named_as = "mixamo" if own else avatar.joint_names
     names = tuple(name_in(named_as, name, prefixed=not own) for name in skeleton.names[1:])
-    ends = CENTIMETRES * tips_m(skeleton.positions_m, rig.skin, avatar.rest_points_m)[1:]
-    write_bvh(path, Bvh(names, parents, offsets, 1 / motion.fps, positions, motion.turns), ends)
+    return Bvh(names, parents, offsets, 1 / motion.fps, positions, motion.turns)
 
 
 def tips_m(joints_m: np.ndarray, skin: Skin, points_m: np.ndarray) -> np.ndarray:

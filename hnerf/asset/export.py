@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from hnerf.asset.baking import Filled, baked_textures
 from hnerf.asset.blender import write_with_blender
-from hnerf.asset.bvh_file import write_avatar_bvh
+from hnerf.asset.bvh_file import write_avatar_bvh, write_avatar_trc
 from hnerf.asset.comparison import Compared, compare_with_field, comparison_figures, require_close
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.extreme_poses import extreme_poses
@@ -289,10 +289,11 @@ def write_files(out: Path, avatars: Avatars, capture: Capture, info: AssetInfo, 
     write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME], info.licence)
     if staged.rates:
         write_avatar_bvh(out / "avatar.bvh", staged)
+        write_avatar_trc(out / "avatar.trc", staged)
     else:
         log.warning(
-            "%s: no avatar_24.usda, avatar_30.usda and avatar.bvh: the captured poses are too far apart to be "
-            "interpolated; list more frames in capture.toml",
+            "%s: no avatar_24.usda, avatar_30.usda, avatar.bvh and avatar.trc: the captured poses are too far apart to "
+            "be interpolated; list more frames in capture.toml",
             capture.name,
         )
     if splats:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hnerf.asset.bvh_file import tips_m, write_avatar_bvh
+from hnerf.asset.bvh_file import tips_m, write_avatar_bvh, write_avatar_trc
 from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.bvh import read_bvh
@@ -53,6 +53,17 @@ def test_bvh_holds_the_captured_motion_in_centimetres(axes: np.ndarray, staged: 
         np.testing.assert_allclose(file.rotations[row, 1], [[1, 0, 0], [0, c, -s], [0, s, c]], atol=1e-6)
         heading = [np.sin(0.8 * frame), 0, np.cos(0.8 * frame)]  # where the axis that faces +Z at rest points
         np.testing.assert_allclose(turns[row, 0] @ [0, 0, 1], heading, atol=1e-6)
+
+
+def test_trc_holds_the_joints_paths_in_metres(staged: StagedAvatar, tmp_path: Path) -> None:
+    """Frame 6, the fourth from frame 3 on, is 0.6 s after frame 0 at 10 a second; its pose is interpolated."""
+    write_avatar_trc(tmp_path / "avatar.trc", staged)
+    lines = (tmp_path / "avatar.trc").read_text().split("\n")
+    assert lines[2:6] == ["10\t10\t6\t2\tm\t10\t3\t6", "Frame#\tTime\tHips\t\t\tupper_L\t\t",
+                          "\t\tX1\tY1\tZ1\tX2\tY2\tZ2", ""]  # fmt: skip
+    assert len(lines[6:]) == 7 and lines[9].split("\t")[0] == "6"
+    found = [float(value) for value in lines[9].split("\t")[1:]]
+    np.testing.assert_allclose(found, [0.6, 0.6, 0.5, -2.0, 0.6, 1.3, -2.0], atol=1e-5)
 
 
 def test_the_tip_of_a_joint_is_the_end_of_its_points() -> None:

@@ -63,7 +63,7 @@ def test_the_mesh_has_the_mean_displacement_of_training_frames() -> None:
 
 
 FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
-FILES |= {"avatar_game.glb", "avatar.bvh", "filled.png", "avatar/texture.png", "avatar/normal_map.png"}
+FILES |= {"avatar_game.glb", "avatar.bvh", "avatar.trc", "filled.png", "avatar/texture.png", "avatar/normal_map.png"}
 FILES |= {f"avatar/{name}.usdc" for name in ("look_captured", "cameras", "rig_full", "rig_game")}
 FILES |= {"avatar/geometry_lod0.usdc", "avatar/geometry_lod1.usdc", "avatar/shape_stout.usdc"}
 FILES |= {"avatar/shape_captured.usdc", "avatar_materialx.usda", "avatar/materialx_captured.usdc"}
@@ -190,11 +190,11 @@ def test_files_at_other_rates_are_left_out_if_poses_are_far_apart(
     slow, tiny = dataclasses.replace(capture(), fps=1.0), TINY.model_copy(update={"topology": "both"})
     report = export_asset(slow, Masks({}, {}), StandInAvatar(bending_body()), tiny, tmp_path)
     assert list(report["motions"]) == ["captured"]
-    assert not {"avatar_24.usda", "avatar_30.usda", "avatar.bvh"} & set(report["bytes"])
+    assert not {"avatar_24.usda", "avatar_30.usda", "avatar.bvh", "avatar.trc"} & set(report["bytes"])
     assert set(report["validation"]) == {"avatar.usda", "avatar_materialx.usda", "avatar.usdz", "avatar_cache.usdz"}
     assert [r.message for r in caplog.records if "avatar.bvh" in r.message] == [
-        "column: no avatar_24.usda, avatar_30.usda and avatar.bvh: the captured poses are too far apart to be "
-        "interpolated; list more frames in capture.toml"
+        "column: no avatar_24.usda, avatar_30.usda, avatar.bvh and avatar.trc: the captured poses are too far apart to "
+        "be interpolated; list more frames in capture.toml"
     ]
 
 
