@@ -8,7 +8,7 @@ from tasks.source import Source
 from tasks.stage import stage
 
 
-@stage("cameras", version="2")
+@stage("cameras", version="3")
 def find_cameras(out: Path, source: Source, programs: tuple[str, ...]) -> dict[str, float]:
     """Find the clocks and cameras of a recording from the person it shows. programs: those installed that read the
     sound of videos, on which the result depends."""

@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("capture", version="24")
+@stage("capture", version="25")
 def ingest(out: Path, source: Source, settings: CaptureSettings, cameras: Artifact | None = None) -> dict[str, float]:
     """Read a recording in any supported layout; undistort and normalise it. cameras: those found from the person, if
     it has no calibration."""

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from hnerf.calibration.clocks.recording import UndeterminedClocksError, synchronise_recording
 from hnerf.calibration.person.recording import calibrate_recording
-from hnerf.capture.clocks import FILE, Clock, read_clocks, write_clocks
-from hnerf.capture.ingest import RATE_TOLERANCE, check_world_of_person
+from hnerf.capture.clocks import FILE, RATE_TOLERANCE, Clock, read_clocks, write_clocks
+from hnerf.capture.ingest import check_world_of_person
 from hnerf.capture.manifest import chosen_cameras, read_manifest
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration, image_folders_in
 from hnerf.errors import InputError

@@ -5,7 +5,7 @@ t_own = (1 + drift_ppm / 10^6) t + offset_s.
 """
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -23,6 +23,7 @@ from hnerf.files import replace_text
 
 FILE = "clocks.toml"
 IRREGULAR = 0.5  # of a frame's duration: how far a video's frames may be off an even rate
+RATE_TOLERANCE = 0.01  # between frame rates that count as the same, as a share
 NOTICED_S = 0.1  # deviation from an even rate beyond which motion looks too fast or too slow
 
 log = logging.getLogger("hnerf.capture")
@@ -105,16 +106,23 @@ def in_step(footage: dict[str, Footage], clocks: Mapping[str, Clock], fps: float
     """Return the footage of all cameras at common instants: the frames of the slowest camera that all cameras recorded.
     Of equally slow cameras, the first with evenly spaced frames is taken, so that its frame numbers tell the time.
 
-    If there are no clocks and no video states that its frames are unevenly spaced, each camera's instants are its own
-    frames. fps: of images without a rate of their own. Raises InputError if a clock is missing or the recordings do not
-    overlap.
+    If there are no clocks, and the videos' time stamps are evenly spaced and do not drift apart, each camera's instants
+    are its own frames. fps: of images without a rate of their own. Raises InputError if a clock is missing or the
+    recordings do not overlap.
     """
     times_s = {name: frame_times_s(one, fps) for name, one in footage.items()}
-    uneven = any(
-        isinstance(one, Video) and one.times_s and not _regular(times_s[name]) for name, one in footage.items()
-    )
-    if not clocks and (len(footage) == 1 or not uneven):
+    stamped_s = [times_s[name] for name, one in footage.items() if isinstance(one, Video) and one.times_s]
+    drifting = _drift_apart(stamped_s)
+    if not clocks and (len(footage) == 1 or not (drifting or any(not _regular(stamps) for stamps in stamped_s))):
         return {name: InStep(one, {frame: frame for frame in one.frames}, one.fps) for name, one in footage.items()}
+    if not clocks:
+        log.warning(
+            "%s: by their time stamps, %s; images are matched by these, not by number (without %s, all cameras are "
+            "taken to start at once)",
+            ", ".join(one.path.name for one in footage.values()),
+            "videos drift apart" if drifting else "frames of a video are unevenly spaced",
+            FILE,
+        )
     clocks = clocks or dict.fromkeys(footage, Clock())
     if missing := sorted(set(footage).difference(clocks)):
         raise InputError(f"{FILE}: camera {missing[0]} is missing; run `hnerf synchronise` again, or add it")
@@ -159,6 +167,16 @@ def _step_s(times_s: np.ndarray) -> float:
 
 def _regular(times_s: np.ndarray) -> bool:
     return _unevenness_s(times_s) <= IRREGULAR * max(_step_s(times_s), 1e-9)
+
+
+def _drift_apart(times_s: Sequence[np.ndarray]) -> bool:
+    """Return whether videos of equally many frames, at rates that count as the same, end more than half a frame apart,
+    as those of 29.97 and 30 frames a second do within 17 s."""
+    if len({len(stamps) for stamps in times_s}) != 1:
+        return False
+    lasts_s = np.array([stamps[-1] - stamps[0] for stamps in times_s])
+    apart_s = np.abs(lasts_s - lasts_s[0])
+    return bool(apart_s.max() > IRREGULAR * _step_s(times_s[0]) and (apart_s <= RATE_TOLERANCE * lasts_s).all())
 
 
 def _unevenness_s(times_s: np.ndarray) -> float:

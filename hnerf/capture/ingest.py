@@ -11,7 +11,7 @@ import numpy as np
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, Capture, SubjectPoint
-from hnerf.capture.clocks import InStep, in_step, warn_if_uneven
+from hnerf.capture.clocks import RATE_TOLERANCE, InStep, in_step, warn_if_uneven
 from hnerf.capture.footage import Footage, Video, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
@@ -55,7 +55,6 @@ from hnerf.progress import tracked
 DEFAULT_FPS = 30.0  # of images, whose files state none
 # Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
 SIZE_TOLERANCE = 0.02
-RATE_TOLERANCE = 0.01  # between frame rates, as a share
 MIN_KEPT_SHARE = 0.5  # of an undistorted image: a lens loses less than a fifth of it
 MAX_MISPLACED_SHARE = 0.5  # of keypoints outside their images (detectors guess some there) or in the first pixel
 LAYOUTS: tuple[type[Layout], ...] = (

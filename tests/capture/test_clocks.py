@@ -68,6 +68,27 @@ def test_of_equally_slow_cameras_one_with_even_frames_sets_the_instants() -> Non
     assert found["a"].frames == (0, 1, 2, 3, 6)  # b's numbers; a's frame 4 is at 0.6 s
 
 
+def even_video(name: str, count: int, step_s: float) -> Video:
+    return Video(Path(name), tuple(range(count)), 1 / step_s, tuple(step_s * frame for frame in range(count)))
+
+
+def test_videos_whose_rates_differ_a_little_are_matched_by_time(caplog: pytest.LogCaptureFixture) -> None:
+    """Frames of b last 1 % longer, so that its frame 40 is shown at 4.04 s. a's frame k is at k / 10 s, b's frame k /
+    1.01. After 40 frames they are 0.04 s apart, after 60 frames 0.06 s, more than half a frame."""
+    short = in_step({"a": even_video("a", 41, 0.1), "b": even_video("b", 41, 0.101)}, {}, 30)
+    assert short["b"].own == short["a"].own and not caplog.messages
+    long = in_step({"a": even_video("a", 61, 0.1), "b": even_video("b", 61, 0.101)}, {}, 30)
+    assert long["b"].own == pytest.approx({frame: frame for frame in range(60)})  # b's frame 60 comes after a's last
+    assert long["a"].own[50] == pytest.approx(50.5) and long["a"].recorded([58]) == {58: 59}
+    assert "a, b: by their time stamps, videos drift apart; images are matched by these" in caplog.text
+
+
+def test_videos_of_different_lengths_or_rates_are_left_to_be_refused() -> None:
+    for other in (even_video("b", 80, 0.1), even_video("b", 80, 0.101), even_video("b", 61, 0.102)):
+        found = in_step({"a": even_video("a", 61, 0.1), "b": other}, {}, 30)
+        assert [one.frames for one in found.values()] == [tuple(range(61)), other.frames]
+
+
 def test_recordings_that_do_not_overlap_and_missing_clocks_are_refused() -> None:
     footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
     with pytest.raises(InputError, match="do not overlap"):
