@@ -128,6 +128,7 @@ def in_step(footage: dict[str, Footage], clocks: Mapping[str, Clock], fps: float
         raise InputError(f"{FILE}: camera {missing[0]} is missing; run `hnerf synchronise` again, or add it")
     slowest = max(footage, key=lambda name: (round(_step_s(times_s[name]), 4), _regular(times_s[name])))
     instants_s = (times_s[slowest] - clocks[slowest].offset_s) / clocks[slowest].rate
+    warn_if_uneven(footage[slowest])
     own = {
         name: _frames_at(np.asarray(one.frames), times_s[name], clocks[name].rate * instants_s + clocks[name].offset_s)
         for name, one in footage.items()
@@ -143,7 +144,7 @@ def in_step(footage: dict[str, Footage], clocks: Mapping[str, Clock], fps: float
 
 
 def warn_if_uneven(one: Footage) -> None:
-    """Warn if the frames of a single video, which are treated as evenly spaced, are not."""
+    """Warn if the frames of a video, which are treated as evenly spaced, are not."""
     if isinstance(one, Video) and one.times_s and (off_s := _unevenness_s(np.asarray(one.times_s))) > NOTICED_S:
         log.warning(
             "%s: frames come up to %.1f s off an even rate, which is assumed, so motion is too fast or too slow in "

@@ -68,6 +68,15 @@ def test_of_equally_slow_cameras_one_with_even_frames_sets_the_instants() -> Non
     assert found["a"].frames == (0, 1, 2, 3, 6)  # b's numbers; a's frame 4 is at 0.6 s
 
 
+def test_an_uneven_video_that_sets_the_instants_gets_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    """Of a's 13 frames, six take 0.1 s and six 0.2 s: by an even rate, its frame 6 would be 0.3 s late, at 0.9 s. b has
+    20 frames a second."""
+    times_s = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8)
+    found = in_step({"a": Video(Path("a"), tuple(range(13)), 12 / 1.8, times_s), "b": images("b", 37, 20)}, {}, 30)
+    assert found["a"].frames == tuple(range(13)) and found["b"].own[7] == pytest.approx(16)
+    assert "a: frames come up to 0.3 s off an even rate" in caplog.text
+
+
 def even_video(name: str, count: int, step_s: float) -> Video:
     return Video(Path(name), tuple(range(count)), 1 / step_s, tuple(step_s * frame for frame in range(count)))
 
