@@ -244,7 +244,11 @@ POSE2SIM = {
     "no camera": (_written(TABLES, "[metadata]\nerror = 0.0\n"), "Calib.toml: calibrates no camera"),
     "NaN": (_edited(TABLES, "50.0", "nan"), "Calib.toml: camera cam01: K"),
     "key missing": (_edited(TABLES, "rotation", "rot"), "Calib.toml: camera cam01: 'rotation'"),
-    "camera is not a table": (_edited(TABLES, "[cam01]", "cam03 = 1\n[cam01]"), "camera cam03"),
+    "camera is not a table": (_written(TABLES, "cam01 = 1\n"), "Calib.toml: calibrates no camera"),
+    "matrix is not one": (
+        _edited(TABLES, "matrix = [[50.0,", "matrix = [["),
+        "Calib.toml: camera cam01: its table, or",
+    ),
     "two cameras of one name": (
         _edited(TABLES, 'name = "cam02"', 'name = "cam01"'),
         "Calib.toml: two cameras are called cam01",

@@ -31,12 +31,12 @@ class Pose2Sim(EasyMocap):
         return {} if (self.folder / "videos").is_dir() else super()._images(camera)
 
 
-def camera_tables(path: Path) -> dict[str, Any]:
-    """Return the tables of cameras in a file of Pose2Sim or aniposelib."""
-    return {key: table for key, table in read_toml(path).items() if key != "metadata"}
+def camera_tables(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the tables of cameras, those with a matrix, in a file of Pose2Sim or aniposelib; Caliscope adds others."""
+    return {key: table for key, table in read_toml(path).items() if isinstance(table, dict) and "matrix" in table}
 
 
-def lenses_from_tables(source: Path, tables: dict[str, Any]) -> dict[str, Lens]:
+def lenses_from_tables(source: Path, tables: dict[str, dict[str, Any]]) -> dict[str, Lens]:
     """Return the lenses in a file's tables of cameras, by name. Raises InputError if there are none, or as
     `lens_from_table` does."""
     lenses = [lens_from_table(source, key, table) for key, table in tables.items()]
@@ -45,16 +45,16 @@ def lenses_from_tables(source: Path, tables: dict[str, Any]) -> dict[str, Lens]:
     return by_name(lenses, source)
 
 
-def lens_from_table(source: Path, key: str, table: Any) -> Lens:
-    """Return the lens in one camera's table, from the keys that aniposelib, Pose2Sim and Caliscope share. Raises
-    InputError if a key is missing or wrong."""
+def lens_from_table(source: Path, key: str, table: dict[str, Any]) -> Lens:
+    """Return the lens in one camera's table, from the keys that aniposelib, Pose2Sim and Caliscope share. It is called
+    `key` unless the table has a name. Raises InputError if a key is missing or wrong."""
     try:
         if table.get("fisheye", False):
             raise InputError(f"{source}: camera {key[:80]}: fisheye lenses are not supported; undistort its video")
         width_px, height_px = table["size"]
         return checked_lens(
             source=source,
-            name=table["name"],
+            name=table.get("name", key),
             K=np.array(table["matrix"], dtype=np.float64),
             distortion=np.array(table["distortions"], dtype=np.float64),
             R=np.array(table["rotation"], dtype=np.float64),
@@ -63,7 +63,7 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
         )
     except KeyError as error:
         raise InputError(f"{source}: camera {key[:80]}: {error} is missing; calibrate again") from None
-    except (AttributeError, OverflowError, TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         raise InputError(
             f"{source}: camera {key[:80]}: its table, or a value in it, has the wrong type or shape; calibrate again"
         ) from None

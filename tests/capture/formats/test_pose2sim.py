@@ -70,6 +70,15 @@ def test_keypoints_and_videos_of_uncalibrated_cameras_get_a_warning(
     ]
 
 
+def test_cameras_are_the_tables_with_a_matrix_and_called_as_these_unless_named(tmp_path: Path) -> None:
+    """As Pose2Sim reads files that Caliscope and others wrote."""
+    folder = rec.write_pose2sim(tmp_path / "walker")
+    file = folder / "calibration" / "Calib.toml"
+    text = file.read_text().replace('[cam02]\nname = "cam02"\n', "[second]\n")
+    file.write_text(f"CreationDate = 2023-03-31T09:56:43\n{text}\n[capture_volume]\nstage = 1\n[charuco]\nrows = 5\n")
+    assert list(Pose2Sim(folder).lenses()) == ["cam01", "second"]
+
+
 def test_keypoint_files_are_sorted_by_the_numbers_in_their_names(tmp_path: Path) -> None:
     """Digits of other scripts count as letters."""
     folder = tmp_path / "pose" / "a_json"
