@@ -3,6 +3,7 @@
 Images and everything else are laid out as in the EasyMocap layout. Caliscope names the footage of its camera 0 `cam_0`.
 """
 
+import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +15,12 @@ import numpy as np
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.pose2sim import camera_tables, lenses_from_tables
 from hnerf.capture.lens import Lens, known_size
-from hnerf.capture.safe_io import path_in_capture, read_toml
+from hnerf.capture.safe_io import path_in_capture, read_toml, shown
 from hnerf.errors import InputError
 
 FILES = ("camera_array.toml", "calibration.toml")
+
+log = logging.getLogger("hnerf.capture")
 
 
 class Caliscope(EasyMocap):
@@ -29,7 +32,7 @@ class Caliscope(EasyMocap):
         return any((folder / name).exists() for name in FILES)
 
     def lenses(self) -> dict[str, Lens]:
-        """Return every camera that the file calibrates and does not ignore."""
+        """Return every camera that the file calibrates, poses and does not ignore."""
         caliscope = path_in_capture(self.folder, "camera_array.toml")
         path = caliscope if caliscope.exists() else path_in_capture(self.folder, "calibration.toml")
         return lenses_from_tables(path, _caliscope_tables(path) if path == caliscope else camera_tables(path))
@@ -67,12 +70,18 @@ def _numbers(lens: Lens) -> str:
 
 
 def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the tables of cameras that are not ignored, with their names."""
+    """Return the tables of cameras that are not ignored, with their names. Warn about those that Caliscope did not
+    pose, and leave them out."""
     cameras = read_toml(path).get("cameras")
     if not isinstance(cameras, dict) or not all(isinstance(table, dict) for table in cameras.values()):
         raise InputError(f"{path}: no tables [cameras.<number>]; calibrate again with Caliscope")
-    return {
+    named = {
         key: table | {"name": f"cam_{table.get('cam_id', table.get('port', key))}"}
         for key, table in cameras.items()
         if not table.get("ignore", False)
     }
+    unposed = [key for key, table in named.items() if "rotation" not in table and "translation" not in table]
+    if unposed:
+        cameras_left_out = ", ".join(shown(named.pop(key)["name"]) for key in unposed)
+        log.warning("%s: left out, since they have no rotation and translation: %s", path, cameras_left_out)
+    return named

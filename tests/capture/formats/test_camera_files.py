@@ -222,6 +222,20 @@ def test_caliscope_cameras_marked_as_ignored_are_left_out(tmp_path: Path) -> Non
         recognise(tmp_path).lenses()
 
 
+def test_caliscope_cameras_without_a_pose_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Unless only half of the pose is missing."""
+    write_cameras(tmp_path, LENSES, "caliscope")
+    text = (tmp_path / "camera_array.toml").read_text()
+    without_rotation = text.replace("rotation = ", "# ", 1)
+    (tmp_path / "camera_array.toml").write_text(without_rotation)
+    with pytest.raises(InputError, match="camera 0: 'rotation' is missing"):
+        recognise(tmp_path).lenses()
+    (tmp_path / "camera_array.toml").write_text(without_rotation.replace("translation = ", "# ", 1))
+    assert not caplog.messages and list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4"]
+    file = tmp_path / "camera_array.toml"
+    assert caplog.messages == [f"{file}: left out, since they have no rotation and translation: 'cam_0'"]
+
+
 def test_a_colmap_capture_is_ingested_with_its_scale(tmp_path: Path) -> None:
     """A unit of the model is half a metre."""
     folder = rec.write_easymocap(tmp_path / "ada")
