@@ -33,7 +33,7 @@ from hnerf.capture.manifest import (
     chosen_frames,
     read_manifest,
 )
-from hnerf.capture.normalise import Normaliser, has_soft_edges, kept_share
+from hnerf.capture.normalise import Normaliser, has_soft_edges, kept_share, lost_share
 from hnerf.capture.safe_io import (
     IMAGE_SUFFIXES,
     JSON_SUFFIXES,
@@ -56,6 +56,7 @@ DEFAULT_FPS = 30.0  # of images, whose files state none
 # Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
 SIZE_TOLERANCE = 0.02
 MIN_KEPT_SHARE = 0.5  # of an undistorted image: a lens loses less than a fifth of it
+MAX_LOST_SHARE = 0.05  # of a recorded image, by undistortion: a wider border can hold hands or feet
 MAX_MISPLACED_SHARE = 0.5  # of keypoints outside their images (detectors guess some there) or in the first pixel
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
@@ -370,11 +371,22 @@ def _write_masks(normaliser: Normaliser, masks: dict[int, StoredFrame], out: Pat
 
 
 def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> None:
-    """Raise InputError if most of the undistorted image of (width, height) pixels was never recorded."""
-    if np.any(lens.distortion) and (kept := kept_share(lens, size_px)) < MIN_KEPT_SHARE:
+    """Raise InputError if most of the undistorted image of (width, height) pixels was never recorded. Warn if it lacks
+    much of what was."""
+    if not np.any(lens.distortion):
+        return
+    if (kept := kept_share(lens, size_px)) < MIN_KEPT_SHARE:
         raise InputError(
             f"{footage}: by the distortion of camera {lens.name}, {1 - kept:.0%} of the picture was never recorded; "
             "calibrate it again"
+        )
+    if (lost := lost_share(lens, size_px)) > MAX_LOST_SHARE:
+        log.warning(
+            "%s: undistortion of camera %s cuts off the borders, %.0f %% of the picture; keep the person away from "
+            "them, or film with a narrower lens",
+            footage,
+            lens.name,
+            100 * lost,
         )
 
 

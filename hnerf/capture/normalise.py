@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import read_rgb, write_image
-from hnerf.capture.lens import Lens, distort_points, undistort_keypoints
+from hnerf.capture.lens import Lens, distort_points, undistort_keypoints, undistort_points
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MAX_ROUNDING = 1.0  # average difference between two decoders, in grey levels
 MAX_LABELS = 64  # levels in a mask of labels; a mask with more has soft edges
-GRID = 32  # samples along each side of an image, to measure what a distortion does
+GRID = 128  # samples along each side of an image, to measure what a distortion does
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,25 @@ def has_soft_edges(mask: np.ndarray, source: Path) -> bool:
 def kept_share(lens: Lens, size_px: tuple[int, int]) -> float:
     """Return the share of an undistorted image of (width, height) pixels that the recorded image covers, from GRID x
     GRID samples."""
-    corner = np.array(size_px) - 1.0
-    at_px = np.stack(np.meshgrid(*np.linspace(0, corner, GRID).T), -1).reshape(-1, 2)
-    recorded_px = distort_points(at_px, lens.K, lens.distortion)
-    return float(((recorded_px >= -0.5) & (recorded_px <= corner + 0.5)).all(1).mean())
+    return float(_inside(distort_points(_samples(size_px), lens.K, lens.distortion), size_px).mean())
+
+
+def lost_share(lens: Lens, size_px: tuple[int, int]) -> float:
+    """Return the share of a recorded image of (width, height) pixels that is beyond the borders of the undistorted
+    image, from GRID x GRID samples."""
+    at_px = undistort_points(_samples(size_px), lens.K, lens.distortion)  # NaN beyond the model
+    return float(1 - _inside(at_px, size_px).mean())
+
+
+def _samples(size_px: tuple[int, int]) -> np.ndarray:
+    """Return the middles (N, 2), in pixels, of GRID x GRID equal parts of an image."""
+    middles = (np.arange(GRID) + 0.5) / GRID
+    return np.stack(np.meshgrid(*(side_px * middles - 0.5 for side_px in size_px)), -1).reshape(-1, 2)
+
+
+def _inside(at_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """Return whether points (N, 2) are in an image of this size (N,)."""
+    return np.all((at_px >= -0.5) & (at_px <= np.array(size_px) - 0.5), axis=1)
 
 
 def _reads_as(path: Path, rgb: np.ndarray) -> bool:

@@ -242,6 +242,22 @@ def test_a_distorted_recording_is_undistorted(folder: Path, tmp_path: Path) -> N
     assert np.array_equal(capture.cameras["01"].K, np.array(rec.K))
 
 
+def test_undistortion_that_cuts_off_much_of_the_picture_gets_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The border 12 px from the middle of 24 x 16 px, 0.6 focal lengths, is imaged at 12 (1 + 0.36 k1). In the middle
+    row, k1 = -0.02 thus cuts off 0.7 % of the pixels, and -0.2 cuts off 7 %; in other rows, more."""
+    folder = rec.write_easymocap(tmp_path / "ada")
+    for k1, cameras in ((-0.02, []), (-0.2, ["01", "02"])):
+        caplog.clear()
+        rec.write_calibration(folder, distortion=(k1, 0, 0, 0, 0))
+        ingest(folder, CaptureSettings(), tmp_path / str(k1))
+        warnings = [message for message in caplog.messages if "cuts off the borders" in message]
+        assert [message.split()[4] for message in warnings] == cameras
+        shares = [int(message.split(", ")[1].split(" %")[0]) for message in warnings]
+        assert all(share >= 7 for share in shares)
+
+
 def test_clean_plates_are_ingested(folder: Path, tmp_path: Path) -> None:
     write_image(folder / "background" / "01.png", rec.picture("01", 99))
     capture = ingest(folder, SETTINGS, tmp_path / "out")

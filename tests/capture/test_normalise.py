@@ -9,17 +9,26 @@ import pytest
 from hnerf.capture.capture import write_image
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.manifest import CaptureManifest, capture_name
-from hnerf.capture.normalise import kept_share
+from hnerf.capture.normalise import kept_share, lost_share
 from hnerf.errors import InputError
 from tests.full_disk import files_up_to
 
 
 def test_kept_share_by_hand() -> None:
-    """A row of 32 px. The lens images a point o px from the middle at o (1 + (o / 16)^2): 10.5 px at 15.02, inside the
-    recorded image, which ends at 16; 11.5 px at 17.4. So 22 of the 32 px are kept."""
+    """A row of 32 px. The lens moves a point 16 u px from the middle outwards, by a factor of 1 + u^2: one at u = 0.682
+    to 16 px, the recorded border. Of the row's height at u, 1 / (1 + u^2) is kept: in all, atan(0.682) = 0.599."""
     K = np.array([[16.0, 0, 15.5], [0, 16, 0], [0, 0, 1]])
     lens = Lens("a", K, np.array([1.0, 0, 0, 0]), np.eye(3), np.zeros(3), (32, 1))
-    assert kept_share(lens, (32, 1)) == 22 / 32
+    assert kept_share(lens, (32, 1)) == pytest.approx(0.599, abs=0.01)
+
+
+def test_lost_share_by_hand() -> None:
+    """A row of 32 px. The lens moves a point 16 u px from the middle inwards, by a factor of 1 - u^2 / 10: the border
+    of the undistorted image, at u = 1, to 14.4 px. The recorded width of du is (1 - 0.3 u^2) du, and 1 - u^2 / 10 of
+    its height is kept: in all, 1 - 0.4 / 3 + 0.03 / 5 = 0.873."""
+    K = np.array([[16.0, 0, 15.5], [0, 16, 0], [0, 0, 1]])
+    lens = Lens("a", K, np.array([-0.1, 0, 0, 0]), np.eye(3), np.zeros(3), (32, 1))
+    assert lost_share(lens, (32, 1)) == pytest.approx(1 - 0.873, abs=0.01)
 
 
 @pytest.mark.parametrize(("skew", "k1", "refused"), [(12.0, -0.1, True), (1e-9, -0.1, False), (12.0, 0.0, False)])
