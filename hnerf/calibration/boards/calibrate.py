@@ -176,6 +176,13 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
         found = estimate_lens(name, source.board.corners_m, source.corners_px[name], source.sizes_px[name])
         if found.reliable_lens and (source is close or name not in given):
             lenses[name], words[name] = found.reliable_lens, f"from {source.path.name}/: {found.certainty}"
+            if not found.describes_corners:
+                log.warning(
+                    "%s: corners are off by %.1f px (RMS), too much for its lens to be right; undistort its video if "
+                    "it is a fisheye, else film a flat, sharp board",
+                    source.path / name,
+                    found.rms_px,
+                )
         elif name in given:
             lenses[name], words[name] = given[name], f"given; {_compared(found, given[name])}"
         else:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from hnerf.calibration.boards.rig import fixes_pose
-from hnerf.capture.lens import Lens
+from hnerf.capture.lens import Lens, known_size
 from hnerf.evenly_spaced import evenly_spaced
 
 MAX_PICTURES = 40  # evenly spaced
@@ -15,6 +15,9 @@ MIN_MOVED = 0.02  # of an image's longer side, by the median corner: pictures of
 MIN_TILTED = 5  # images; boards parallel to the image plane say nothing about the focal length or its error
 TILT_DEG = 15.0
 K3_SIGMAS = 5.0  # standard deviations that k3 must exceed: few lenses need it, and it bends images beyond the corners
+# Of an image's longer side: three times what webcams leave. Equidistant fisheyes of 125 degrees across leave as much;
+# rays are then off by 2 degrees.
+MAX_RMS = 0.0005
 MAX_FOCAL_STD = 0.01  # relative standard deviation up to which a focal length is trusted
 
 
@@ -22,12 +25,13 @@ MAX_FOCAL_STD = 0.01  # relative standard deviation up to which a focal length i
 class LensEstimate:
     """Estimated lens. pictures: number of images used, between which the board moved; lens: None if they are too few;
     tilted: how many of them show the board TILT_DEG or more out of the image plane; focal_std: the focal length's
-    relative standard deviation."""
+    relative standard deviation; rms_px: how far corners are from where the lens images them."""
 
     pictures: int
     lens: Lens | None = None
     tilted: int = 0
     focal_std: float = np.inf
+    rms_px: float = np.inf
 
     @property
     def reliable_lens(self) -> Lens | None:
@@ -35,11 +39,17 @@ class LensEstimate:
         return self.lens if self.focal_std <= MAX_FOCAL_STD and self.tilted >= MIN_TILTED else None
 
     @property
+    def describes_corners(self) -> bool:
+        """Return whether a lens was found that images the corners where they are, as no lens of this model does for a
+        fisheye."""
+        return self.lens is not None and self.rms_px <= MAX_RMS * max(known_size(self.lens))
+
+    @property
     def certainty(self) -> str:
         """Return how well the lens is known, in words."""
         if self.lens is None:
             return f"pictures between which the board moved: {self.pictures} where {MIN_PICTURES} are needed"
-        known = f"focal length known to {100 * self.focal_std:.1f} %"
+        known = f"focal length known to {100 * self.focal_std:.1f} %, corners off by {self.rms_px:.2f} px"
         return f"{self.pictures} pictures of the board, {self.tilted} of them tilted, {known}"
 
 
@@ -58,7 +68,7 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
     points_m = [corners_m[s].astype(np.float32) for s in seen]
     points_px = [corners_px[f, s].astype(np.float32) for f, s in zip(chosen, seen, strict=True)]
     for flags in (0, cv2.CALIB_FIX_K3):
-        _, K, distortion, turns, _, deviation, _, _ = cv2.calibrateCameraExtended(
+        rms_px, K, distortion, turns, _, deviation, _, _ = cv2.calibrateCameraExtended(
             points_m, points_px, size_px, np.eye(3), np.zeros(5), flags=flags
         )
         needs_k3 = abs(distortion.ravel()[4]) > K3_SIGMAS * deviation[8, 0]
@@ -66,7 +76,8 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
             break
     lens = Lens(name, K, distortion.ravel()[: 5 if needs_k3 else 4], np.eye(3), np.zeros(3), size_px)
     tilted = sum(abs(cv2.Rodrigues(turn)[0][2, 2]) < np.cos(np.deg2rad(TILT_DEG)) for turn in turns)
-    return LensEstimate(len(chosen), lens, tilted, float(max(deviation[0, 0] / K[0, 0], deviation[1, 0] / K[1, 1])))
+    focal_std = float(max(deviation[0, 0] / K[0, 0], deviation[1, 0] / K[1, 1]))
+    return LensEstimate(len(chosen), lens, tilted, focal_std, rms_px)
 
 
 def _moved(corners_px: np.ndarray, least_px: float) -> list[int]:
