@@ -26,6 +26,7 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 FORMATS = "format_whitelist;mov"
 PROGRESS_FRAMES = 100  # between two reports
 MIN_FPS, MAX_FPS = 0.01, 10_000.0  # of a recording
+MAX_PIXEL_ASPECT = 3.0  # anamorphic lenses, as the widest pixels that are filmed, squeeze pictures by 2
 
 
 class VideoFrame(NamedTuple):
@@ -108,6 +109,16 @@ class Video:
             raise InputError(
                 f"{self.path}: its pictures look the same; if it is interlaced, export it as progressive H.264"
             )
+
+    @property
+    def pixel_aspect(self) -> float:
+        """Return the width of a pixel over its height, as the file states it, turned as pictures are; 1 if it states
+        none that a camera could have."""
+        stream = _open_stream(self.path)
+        width, height = stream.get(cv2.CAP_PROP_SAR_NUM), stream.get(cv2.CAP_PROP_SAR_DEN)
+        if not 1 / MAX_PIXEL_ASPECT <= width / max(height, 1) <= MAX_PIXEL_ASPECT:
+            return 1.0
+        return height / width if stream.get(cv2.CAP_PROP_ORIENTATION_META) % 180 else width / height
 
 
 Footage = ImageFolder | Video

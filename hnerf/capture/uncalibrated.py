@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hnerf.capture.clocks import Clock
-from hnerf.capture.footage import Footage
+from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.pose2sim import lens_from_table
@@ -135,15 +135,16 @@ def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLe
     else that in the metadata of the first image or the video, else the usual one."""
     first = next(footage.read(footage.frames[:1]))
     width_px, height_px = first.size_px
-    longer_px = max(width_px, height_px)
+    aspect = footage.pixel_aspect if isinstance(footage, Video) else 1.0
+    sides = np.array([aspect * width_px, height_px])  # in heights of a pixel, as is the focal length
     equivalent_mm = focal_35mm(first.file or footage.path)
-    focal_px, source = USUAL_FOCAL * longer_px, ""
+    focal, source = USUAL_FOCAL * sides.max(), ""
     if fov_deg:
-        focal_px, source = longer_px / 2 / np.tan(np.deg2rad(fov_deg) / 2), f"{fov_deg:g} degrees given"
+        focal, source = sides.max() / 2 / np.tan(np.deg2rad(fov_deg) / 2), f"{fov_deg:g} degrees given"
     elif equivalent_mm:
-        focal_px = equivalent_mm / DIAGONAL_35MM * np.hypot(width_px, height_px)
+        focal = equivalent_mm / DIAGONAL_35MM * np.linalg.norm(sides)
         source = f"{equivalent_mm:g} mm, metadata"
-    K = np.array([[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]])
+    K = np.array([[focal / aspect, 0, (width_px - 1) / 2], [0, focal, (height_px - 1) / 2], [0, 0, 1]])
     lens = Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px), estimated=True)
     return KnownLens(lens, source)
 

@@ -77,14 +77,22 @@ def trim(path: Path, *edits: tuple[int | None, int], wide: bool = False) -> None
 
 def state_transfer(path: Path, transfer: int) -> None:
     """Make a video state the transfer characteristics of its colours, as `colr`."""
+    _state(path, box(b"colr", b"nclx" + struct.pack(">HHHB", 9, transfer, 9, 0)))
 
-    def coloured(content: bytes) -> bytes:
+
+def state_pixel_aspect(path: Path, width: int, height: int) -> None:
+    """Make a video state the aspect ratio of its pixels, as `pasp`."""
+    _state(path, box(b"pasp", struct.pack(">II", width, height)))
+
+
+def _state(path: Path, stated: bytes) -> None:
+    """Put a box behind those that describe a video's pictures."""
+
+    def described(content: bytes) -> bytes:
         size, kind = struct.unpack(">I4s", content[8:16])
-        return content[:8] + box(
-            kind, content[16 : 8 + size] + box(b"colr", b"nclx" + struct.pack(">HHHB", 9, transfer, 9, 0))
-        )
+        return content[:8] + box(kind, content[16 : 8 + size] + stated)
 
-    _edit(path, b"stsd", coloured)
+    _edit(path, b"stsd", described)
 
 
 def declare_samples(path: Path, count: int) -> None:

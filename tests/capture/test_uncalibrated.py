@@ -14,11 +14,11 @@ from hnerf.capture.formats import easymocap
 from hnerf.capture.formats.from_person import FromPerson
 from hnerf.capture.ingest import ingest, lacks_calibration, recognise
 from hnerf.capture.lens import Lens
-from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
+from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration, lens_by_angle
 from hnerf.capture.video_metadata import KEY, MAX_METADATA_BYTES, focal_35mm
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
-from tests.capture.mp4 import box
+from tests.capture.mp4 import QUARTER_TURN, box, show_as, state_pixel_aspect
 from tests.capture.recordings import write_easymocap, write_video
 
 
@@ -65,6 +65,25 @@ def test_a_videos_metadata_give_the_focal_length(tmp_path: Path) -> None:
     start = whole.index(b"moov") - 4  # the last box may omit its size, however much comes before
     video.write_bytes(box(b"free", bytes(MAX_METADATA_BYTES)) + whole[:start] + bytes(4) + whole[start + 4 :])
     assert focal_35mm(video) == 28
+
+
+def test_pixels_that_are_not_square_have_two_focal_lengths(tmp_path: Path) -> None:
+    """90 x 60 pixels, 4/3 as wide as they are high, are shown as 120 x 60: 90 degrees across have a focal length of 60
+    heights, or 45 widths, of a pixel. Turned by 90 degrees, they are 60 x 90 pixels, 3/4 as wide as they are high, or
+    45 x 90 shown: 45 heights, or 60 widths. No camera has pixels a hundred times as wide as high."""
+    video = tmp_path / "a.mp4"
+    for stated, matrix, focal_px in (
+        ((4, 3), None, (45, 60)),
+        ((4, 3), QUARTER_TURN, (60, 45)),
+        ((100, 1), None, (45, 45)),
+        ((0, 0), None, (45, 45)),
+    ):
+        write_video(video, 2, size_px=(90, 60))
+        state_pixel_aspect(video, *stated)
+        if matrix:
+            show_as(video, matrix)
+        K = lens_by_angle("a", Video(video, (0,), None), 90).lens.K
+        assert (K[0, 0], K[1, 1]) == pytest.approx(focal_px)
 
 
 def test_a_tracks_metadata_give_the_focal_length_if_the_movies_do_not(tmp_path: Path) -> None:
