@@ -9,7 +9,15 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidatorFunctionWrapHandler, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 
 from hnerf.capture.capture import SubjectPoint
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
@@ -24,6 +32,8 @@ MIN_KEY_SIMILARITY = 0.8  # of an unknown key to a known one (difflib), from whi
 MAX_BYTES = 65_536
 NAMED_BY, NUMBER = "nearest", r"\s*(-?\d{1,9}(?:\.\d*)?)\s*"
 SUBJECT = re.compile(rf"nearest to \({NUMBER},{NUMBER}\)(?: in (.+?)(?: at frame (\d{{1,9}}))?)?")
+RANGE = re.compile(r"\d{1,9}:\d{1,9}(:[1-9]\d{0,8})?")
+MAX_RANGE = 1_000_000  # frames: nine hours at 30 a second, and a bound on memory
 NO_FRAME = -1  # of a subject's point without a frame
 MAX_NAME_BYTES = 200  # file systems allow 255, which must also hold longer names made from it
 
@@ -46,6 +56,18 @@ class FrameSplit(_Table):
 
     train: list[FrameNumber] = Field(min_length=1)
     novel_pose: list[FrameNumber] = []
+
+    @field_validator("train", "novel_pose", mode="before")
+    @classmethod
+    def _written_out(cls, frames: Any, info: ValidationInfo) -> Any:
+        """Return the frames of a range, without those that are trained on if it is of novel poses."""
+        if not isinstance(frames, str):
+            return frames
+        numbers = range(*map(int, frames.split(":"))) if RANGE.fullmatch(frames) else range(0)
+        if not 0 < len(numbers) <= MAX_RANGE:
+            raise ValueError('give a list of frames, or "FIRST:END" or "FIRST:END:STEP", END excluded')
+        trained = set(info.data.get("train", ()))
+        return [frame for frame in numbers if frame not in trained]
 
 
 TABLES: dict[str, type[_Table]] = {"cameras": CameraSplit, "frames": FrameSplit}

@@ -12,8 +12,10 @@ from PIL import Image
 
 from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.ingest import ingest
+from hnerf.capture.manifest import read_manifest
 from hnerf.capture.video_metadata import is_hdr
 from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 from tests.capture.mp4 import state_transfer, write_video
 from tests.shared_data import shared_capture
@@ -76,6 +78,17 @@ def test_capture_toml_sets_names_and_splits(folder: Path, tmp_path: Path) -> Non
     assert (capture.train_cameras, capture.test_cameras) == (("02",), ("01",))
     assert (capture.train_frames, capture.novel_pose_frames, capture.frames) == ((1, 3), (4,), (1, 3, 4))
     assert {p.name[:6] for p in (tmp_path / "out" / "images" / "01").iterdir()} == {"000001", "000003", "000004"}
+
+
+def test_frames_may_be_ranges(tmp_path: Path) -> None:
+    """Their ends are excluded, as in Python. A range of novel poses goes around the frames that are trained on."""
+    (tmp_path / "capture.toml").write_text('[frames]\ntrain = "1:8:3"\nnovel_pose = "3:7"\n')
+    frames = read_manifest(tmp_path).frames
+    assert frames is not None and (frames.train, frames.novel_pose) == ([1, 4, 7], [3, 5, 6])
+    for wrong in ("3", "3:", "a:b", "3:3", "0:1000001", "0:9:0", "0:9999999999"):
+        (tmp_path / "capture.toml").write_text(f'[frames]\ntrain = "{wrong}"\n')
+        with pytest.raises(InputError, match=r'frames\.train: give a list of frames, or "FIRST:END"'):
+            read_manifest(tmp_path)
 
 
 @pytest.mark.parametrize(("transfer", "hdr"), {"Rec. 709": (1, False), "PQ": (16, True), "HLG": (18, True)}.values())
