@@ -39,8 +39,8 @@ def write_openpose(path: Path, keypoints: np.ndarray) -> None:
 
 
 def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
-    """Read a list of {image_id, keypoints, score}, as MMPose, RTMPose and AlphaPose write for a whole recording; return
-    people for each of the frames as `read_openpose` does.
+    """Read a list of {image_id, keypoints, score}, as AlphaPose writes for a whole recording, or what MMPose writes for
+    a video; return people for each of the frames as `read_openpose` does.
 
     image_id: the frame's number, or an image name that ends in it. Frames that are not listed show nobody. Raises
     InputError if it is no such file, or lists other frames.
@@ -48,7 +48,7 @@ def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
     frames = tuple(frames)
     try:
         people: dict[int, list[Any]] = {}
-        results = read_json(path, MAX_TEXT_BYTES + FRAME_BYTES * len(frames))
+        results = _as_coco(read_json(path, MAX_TEXT_BYTES + FRAME_BYTES * len(frames)))
         if len(results) > MAX_PEOPLE * len(frames):
             raise InputError(
                 f"{path}: {len(results)} people in {len(frames)} images; keep at most {MAX_PEOPLE} in each"
@@ -63,6 +63,22 @@ def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
             "number them as the pictures are, videos from 0"
         )
     return [_people(path, _check_count(path, people.get(frame, []))) for frame in frames]
+
+
+def _as_coco(found: Any) -> Any:
+    """Return MMPose's predictions for a video as COCO results, anything else as it is. MMPose's demos count frames from
+    1, its inferencer from 0. Raises KeyError, TypeError or ValueError if a value is missing or wrong."""
+    frames, first = (found["instance_info"], 1) if isinstance(found, dict) else (found, 0)
+    if not frames or "instances" not in frames[0]:
+        return frames
+    return [
+        {
+            "image_id": frame["frame_id"] - first,
+            "keypoints": [[*at, sure] for at, sure in zip(one["keypoints"], one["keypoint_scores"], strict=True)],
+        }
+        for frame in frames
+        for one in frame["instances"]
+    ]
 
 
 def _frame(image_id: object) -> int:

@@ -204,7 +204,7 @@ def test_all_frames_are_padded_to_the_largest_number_of_people() -> None:
 
 
 def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
-    """Results are as AlphaPose (image names) and MMPose (numbers) write them; scores over 1 count as 1."""
+    """Results are as AlphaPose (image names) and COCO's tools (numbers) write them; scores over 1 count as 1."""
     sure = points(17)
     sure[:, 2] = 3
     results = [
@@ -225,6 +225,22 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
         (tmp_path / "01.json").write_text(json.dumps([{"image_id": name, "keypoints": []}]))
         with pytest.raises(InputError, match=r"01\.json: no list of image_id"):
             read_results(tmp_path / "01.json", (0, 1, 3))
+
+
+def test_predictions_of_mmpose_are_read(tmp_path: Path) -> None:
+    """Nobody is in the first picture. Its demos count that as 1, its inferencer as 0."""
+    person = {"keypoints": points(17)[:, :2].tolist(), "keypoint_scores": points(17)[:, 2].tolist(), "bbox": [[0] * 4]}
+    for first in (0, 1):
+        seen = [{"frame_id": first, "instances": []}, {"frame_id": first + 1, "instances": [person]}]
+        written = {"meta_info": {}, "instance_info": seen} if first else seen
+        (tmp_path / "01.json").write_text(json.dumps(written))
+        nobody, one = read_results(tmp_path / "01.json", (0, 1))
+        assert len(nobody) == 0 and np.allclose(one, points(17)[None])
+    for wrong in ({}, {"instances": 3}, {"frame_id": "1", "instances": [person]},
+                  {"frame_id": 1, "instances": [person | {"keypoint_scores": []}]}):  # fmt: skip
+        (tmp_path / "01.json").write_text(json.dumps({"instance_info": [{"frame_id": 1, "instances": []}, wrong]}))
+        with pytest.raises(InputError, match=r"01\.json: no list of image_id"):
+            read_results(tmp_path / "01.json", (0, 1))
 
 
 def test_lists_of_results_may_grow_with_the_recording(tmp_path: Path) -> None:
