@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-COPIED = ("hnerf", "tasks", "flows", "tests", "configs", "pyproject.toml")
+COPIED = ("hnerf", "tasks", "flows", "tests", "configs", "docs", "pyproject.toml")
 LIMIT_S = 300.0  # for the tests of one fault, which take seconds; some faults make them wait forever
 PYTEST = (sys.executable, "-m", "pytest", "-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider")
 
