@@ -576,6 +576,19 @@ FAULTS = (
     Fault("named-files", "config", "isinstance(value, Path) and not value.is_file()", "False"),
     Fault("view-elsewhere", "render/page", "    asyncio.run(_check_host(host))\n", ""),
     Fault("iou-of-nobody", "evaluation/metrics", " if union else 1.0", ""),
+    # found by a motion capture engineer
+    Fault("clocks-drifting", "capture/clocks", "apart_s.max() > IRREGULAR", "apart_s.max() > 99"),
+    Fault("clocks-uneven-instants", "capture/clocks", "    warn_if_uneven(footage[slowest])\n", ""),
+    Fault("pose2sim-tables", "capture/formats/pose2sim", 'isinstance(table, dict) and "matrix" in table', "True"),
+    Fault("caliscope-unposed", "capture/formats/caliscope", "    if unposed:", "    if False:",
+          seen_by="capture/formats/camera_files"),
+    Fault("undistortion-lost", "capture/ingest", "> MAX_LOST_SHARE:", "> 1:"),
+    Fault("board-lens-rms", "calibration/boards/calibrate", "if not found.describes_corners:", "if False:"),
+    Fault("pixel-aspect-turned", "capture/footage", "height / width if stream.get(cv2.CAP_PROP_ORIENTATION_META) % 180",
+          "height / width if False", seen_by="capture/uncalibrated"),
+    Fault("ranges-overlap", "capture/manifest", "if frame not in trained]", "]", seen_by="capture/ingest"),
+    Fault("mmpose-first", "capture/keypoint_files", 'frame["frame_id"] - first', 'frame["frame_id"]',
+          seen_by="capture/keypoint_sets"),
 )  # fmt: skip
 
 
