@@ -22,6 +22,7 @@ from hnerf.progress import tracked
 
 CAPTURED = "captured"  # the motion at the capture's own rate, whose time codes are the capture's frames
 RATES = (24, 30)  # frames a second at which it is resampled, since many importers ignore a file's rate
+SMALL_WEIGHT = 1e-3  # at which correctives change normals in proportion to it
 STILL_M = 1e-5  # points that a blend shape moves by less count as unmoved
 REST_POSE = "A"  # of every body model here: arms slanting down
 
@@ -88,10 +89,19 @@ class StagedAvatar:
 
     @cached_property
     def normal_changes(self) -> dict[str, np.ndarray]:
-        """Return how correctives, expressions and physiques change the normals, (V, 3) float32, by name."""
-        shapes_m = (self.blend_shapes_m | self.physiques_m).items()
-        changed = {name: normals_of(self.rest_points_m + m, self.faces) - self.normals for name, m in shapes_m}
-        return {name: change.astype(np.float32) for name, change in changed.items()}
+        """Return how correctives, expressions and physiques change the normals per weight, (V, 3) float32, by name.
+
+        Correctives act together and largely cancel each other, so theirs are the derivatives at rest.
+        """
+
+        def change(moved_m: np.ndarray, weight: float = 1.0) -> np.ndarray:
+            changed = normals_of(self.rest_points_m + weight * moved_m, self.faces) - self.normals
+            return (changed / weight).astype(np.float32)
+
+        correctives = zip(shape_names(self), self.shapes_m, strict=True)
+        shapes_m = self.expressions_m | self.physiques_m
+        changes = {name: change(moved_m, SMALL_WEIGHT) for name, moved_m in correctives}
+        return changes | {name: change(moved_m) for name, moved_m in shapes_m.items()}
 
     @property
     def looks(self) -> dict[str, np.ndarray]:

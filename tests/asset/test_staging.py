@@ -158,6 +158,27 @@ def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:
     np.testing.assert_array_equal(triangle.vertex_colours, [[3, 0, 0], [3, 3, 0], [0, 0, 0]])
 
 
+def one_triangle(staged: StagedAvatar, shapes_m: np.ndarray, expressions_m: dict[str, np.ndarray]) -> StagedAvatar:
+    """Return the avatar with a single triangle, whose second corner, on the x axis, the shapes move up, along z."""
+    corners_m = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    level = Level(np.arange(3), np.array([[0, 1, 2]]), LAYOUT)
+    parts: dict[str, Any] = {"shapes_m": shapes_m, "expressions_m": expressions_m, "physiques_m": {}}
+    return dataclasses.replace(staged, rest_points_m=corners_m, levels=[level], **parts)
+
+
+UP_1_M = np.array([[0, 0, 0], [0, 0, 1], [0, 0, 0]], np.float32)
+TILTED = np.array([-np.sqrt(0.5), 0, np.sqrt(0.5) - 1])  # from (0, 0, 1) to the normal of a slope of 45 degrees
+
+
+def test_normal_changes_of_correctives_add_up_like_their_offsets(staged: StagedAvatar) -> None:
+    """With its corner raised by w, the triangle has the normal (-w, 0, 1) / sqrt(1 + w^2), whose derivative at w = 0 is
+    (-1, 0, 0). Corrective shapes of 1 m and -1 m together move nothing, and must not turn the normal either."""
+    changes = one_triangle(staged, np.stack([UP_1_M, -UP_1_M]), {"smile": UP_1_M}).normal_changes
+    np.testing.assert_allclose(changes["corrective_01"], np.tile([-1, 0, 0], (3, 1)), atol=1e-3)
+    np.testing.assert_allclose(changes["corrective_02"], np.tile([1, 0, 0], (3, 1)), atol=1e-3)
+    np.testing.assert_allclose(changes["smile"], np.tile(TILTED, (3, 1)), atol=1e-6)
+
+
 def test_expressions_and_physiques_are_rotated_to_stage_axes(staged: StagedAvatar) -> None:
     stout_m = 0.3 * staged.rest_points_m * (1, 0, 1)  # the column stands on the vertical axis
     np.testing.assert_allclose(staged.physiques_m["stout"], stout_m, atol=1e-6)
