@@ -91,17 +91,21 @@ class StagedAvatar:
     def normal_changes(self) -> dict[str, np.ndarray]:
         """Return how correctives, expressions and physiques change the normals per weight, (V, 3) float32, by name.
 
-        Correctives act together and largely cancel each other, so theirs are the derivatives at rest.
+        Correctives act together and largely cancel each other, so theirs are the derivatives at rest. `mouthClose`
+        closes a jaw that `jawOpen` has opened, so its changes are from the open mouth.
         """
 
-        def change(moved_m: np.ndarray, weight: float = 1.0) -> np.ndarray:
-            changed = normals_of(self.rest_points_m + weight * moved_m, self.faces) - self.normals
+        def change(moved_m: np.ndarray, weight: float = 1.0, start_m: np.ndarray | float = 0.0) -> np.ndarray:
+            points_m = self.rest_points_m + start_m
+            changed = normals_of(points_m + weight * moved_m, self.faces) - normals_of(points_m, self.faces)
             return (changed / weight).astype(np.float32)
 
         correctives = zip(shape_names(self), self.shapes_m, strict=True)
-        shapes_m = self.expressions_m | self.physiques_m
         changes = {name: change(moved_m, SMALL_WEIGHT) for name, moved_m in correctives}
-        return changes | {name: change(moved_m) for name, moved_m in shapes_m.items()}
+        changes |= {name: change(moved_m) for name, moved_m in (self.expressions_m | self.physiques_m).items()}
+        if "mouthClose" in changes:
+            changes["mouthClose"] = change(self.expressions_m["mouthClose"], start_m=self.expressions_m["jawOpen"])
+        return changes
 
     @property
     def looks(self) -> dict[str, np.ndarray]:

@@ -179,6 +179,15 @@ def test_normal_changes_of_correctives_add_up_like_their_offsets(staged: StagedA
     np.testing.assert_allclose(changes["smile"], np.tile(TILTED, (3, 1)), atol=1e-6)
 
 
+def test_a_mouth_that_is_closed_on_an_open_jaw_has_its_normals_of_before(staged: StagedAvatar) -> None:
+    """`jawOpen` lowers the corner by 1 m, and `mouthClose` raises it by as much."""
+    changes = one_triangle(
+        staged, np.zeros((0, 3, 3), np.float32), {"jawOpen": -UP_1_M, "mouthClose": UP_1_M}
+    ).normal_changes
+    np.testing.assert_allclose(changes["jawOpen"], np.tile(TILTED * (-1, 1, 1), (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(changes["mouthClose"], -changes["jawOpen"], atol=1e-6)
+
+
 def test_expressions_and_physiques_are_rotated_to_stage_axes(staged: StagedAvatar) -> None:
     stout_m = 0.3 * staged.rest_points_m * (1, 0, 1)  # the column stands on the vertical axis
     np.testing.assert_allclose(staged.physiques_m["stout"], stout_m, atol=1e-6)
