@@ -20,7 +20,8 @@ from hnerf.body.skeletons import JointNames, name_in
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
 RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # left out: glTF times are in seconds
-VARIANTS, SPECULAR = "KHR_materials_variants", "KHR_materials_specular"
+VARIANTS, SPECULAR, UNLIT = "KHR_materials_variants", "KHR_materials_specular", "KHR_materials_unlit"
+LOOKS = {"captured": {UNLIT: {}}, "albedo": {SPECULAR: {"specularFactor": 0.0}}}  # no sheen: it is in the colours
 DENSE_SHARE = 0.75  # of the vertices; if a blend shape moves more, 4-byte indices cost more than 12-byte zeros
 STILL = 1e-6  # metres or radians; a joint that moves less stays at rest
 SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
@@ -154,21 +155,21 @@ def _vertex_data(writer: GlbWriter, values: np.ndarray, dtype: type) -> int:
 
 
 def _add_materials(writer: GlbWriter, avatar: StagedAvatar, primitive: gltf.Primitive) -> None:
-    """Add the captured look, which the primitive uses, and, if there is an albedo, a material variant for it."""
+    """Add the captured look, which the primitive uses and which is unlit, since light is in its colours, and, if there
+    is an albedo, a material variant for it."""
     document = writer.document
-    document.extensionsUsed = [SPECULAR]
+    document.extensionsUsed = [UNLIT]
     document.samplers.append(gltf.Sampler(wrapS=gltf.CLAMP_TO_EDGE, wrapT=gltf.CLAMP_TO_EDGE))
     normals = None if avatar.normal_map is None else _add_texture(writer, avatar.normal_map)
     for name, texture in avatar.looks.items():
         colours = gltf.TextureInfo(index=_add_texture(writer, texture))
         matte = gltf.PbrMetallicRoughness(baseColorTexture=colours, metallicFactor=0.0, roughnessFactor=1.0)
-        no_sheen = {SPECULAR: {"specularFactor": 0.0}}  # what there was is already in the colours
-        material = gltf.Material(name=name.capitalize(), pbrMetallicRoughness=matte, extensions=no_sheen)
+        material = gltf.Material(name=name.capitalize(), pbrMetallicRoughness=matte, extensions=LOOKS[name])
         if normals is not None:
             material.normalTexture = gltf.NormalMaterialTexture(index=normals)
         document.materials.append(material)
     if avatar.albedo:
-        document.extensionsUsed.append(VARIANTS)
+        document.extensionsUsed += [SPECULAR, VARIANTS]
         document.extensions = {VARIANTS: {"variants": [{"name": name} for name in avatar.looks]}}
         mappings = [{"material": k, "variants": [k]} for k in range(len(avatar.looks))]
         primitive.extensions = {VARIANTS: {"mappings": mappings}}

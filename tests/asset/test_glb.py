@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from hnerf.asset.glb import SPECULAR, VARIANTS, write_glb
+from hnerf.asset.glb import SPECULAR, UNLIT, VARIANTS, write_glb
 from hnerf.asset.staging import StagedAvatar, moved_points
 from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
@@ -163,7 +163,7 @@ def test_a_normal_map_and_an_albedo_can_be_left_out(staged: StagedAvatar, tmp_pa
     write_glb(tmp_path / "smooth.glb", bare, staged.rigs["full"])
     document = pygltflib.GLTF2.load(str(tmp_path / "smooth.glb"))
     assert document.meshes[0].primitives[0].attributes.TANGENT is None
-    assert document.extensionsUsed == [SPECULAR] and len(document.materials) == 1
+    assert document.extensionsUsed == [UNLIT] and len(document.materials) == 1
     assert document.materials[0].normalTexture is None and len(document.images) == 1
 
 
@@ -186,11 +186,14 @@ def test_the_albedo_is_another_variant_of_the_material(glb: Path, staged: Staged
     np.testing.assert_array_equal(shown["albedo"], staged.albedo.texture)
 
 
-def test_no_look_has_a_sheen(glb: Path) -> None:
+def test_the_captured_look_is_unlit_and_the_albedo_has_no_sheen(glb: Path) -> None:
+    """Programs without the extension show a matte material."""
     document = pygltflib.GLTF2.load(str(glb))
-    assert set(document.extensionsUsed) == {SPECULAR, VARIANTS}
-    factors = [material.extensions[SPECULAR]["specularFactor"] for material in document.materials]
-    assert factors == [0, 0]
+    assert set(document.extensionsUsed) == {UNLIT, SPECULAR, VARIANTS}
+    found = {material.name: material.extensions for material in document.materials}
+    assert found == {"Captured": {UNLIT: {}}, "Albedo": {SPECULAR: {"specularFactor": 0}}}
+    matte = [material.pbrMetallicRoughness for material in document.materials]
+    assert [(m.metallicFactor, m.roughnessFactor) for m in matte] == [(0, 1)] * 2
 
 
 def test_motion_is_in_seconds_from_the_first_frame(glb: Path) -> None:

@@ -333,11 +333,18 @@ def test_the_albedo_is_shown_in_the_pages_light(page: Page) -> None:
 
 
 @NEEDS_THREE
+def test_lit_looks_have_the_normal_map(page: Page) -> None:
+    """It has 32 px, and the textures 64."""
+    names = ("Clay", "Wireframe", "Albedo")
+    assert [page.evaluate(f"viewer.looks.materials.{name}.normalMap.image.width") for name in names] == [32] * 3
+
+
+@NEEDS_THREE
 def test_without_an_albedo_the_page_does_not_offer_it(page: Page) -> None:
     names = page.evaluate(
         "import('viewer/looks.js').then(({ Looks }) => {"
         "  const mesh = viewer.avatar.mesh.clone(); mesh.material = viewer.looks.materials.Clay;"
-        "  return new Looks(mesh, null).names;"
+        "  return new Looks(mesh, null, null).names;"
         "})"
     )
     assert names == ["Textured", "Clay", "Wireframe", "Weights"]

@@ -9,12 +9,13 @@ const GROUND_SAMPLES = 6; // instants of a motion at which its lowest point is s
 export class Avatar {
   static async load(bytes) {
     const gltf = await new GLTFLoader().parseAsync(bytes, "");
-    return new Avatar(gltf, await albedoOf(gltf.parser));
+    return new Avatar(gltf, await albedoOf(gltf.parser), await normalMapOf(gltf.parser));
   }
 
-  constructor(gltf, albedo) {
+  constructor(gltf, albedo, normalMap) {
     this.root = gltf.scene;
     this.albedo = albedo;
+    this.normalMap = normalMap;
     this.motions = gltf.animations;
     this.root.traverse((node) => node.isSkinnedMesh && (this.mesh = node)); // there is one
     this.mesh.frustumCulled = false; // its bounds are those of the rest pose
@@ -132,6 +133,12 @@ export class Avatar {
 async function albedoOf(parser) {
   const index = parser.json.materials.findIndex(({ name }) => name === "Albedo");
   return index < 0 ? null : (await parser.getDependency("material", index)).map;
+}
+
+// Returns the normal map, or null. The loader leaves it out of the mesh's own material, which is unlit.
+async function normalMapOf(parser) {
+  const { normalTexture } = parser.json.materials[0];
+  return normalTexture ? parser.getDependency("texture", normalTexture.index) : null;
 }
 
 // Returns the blend shapes, and whether a motion uses them; those that none uses are expressions and physiques.

@@ -9,10 +9,10 @@ const WIRE = 0x2f6fb5;
 const RAMP = [0x26324a, 0x2a6f97, 0x52b788, 0xf9c74f, 0xe63946].map((c) => new THREE.Color(c)); // weights 0 to 1
 
 export class Looks {
-  // albedo: a texture, or null.
-  constructor(mesh, albedo) {
+  // albedo, normalMap: textures, or null.
+  constructor(mesh, albedo, normalMap) {
     this.mesh = mesh;
-    this.materials = materialsOf(mesh.material, albedo);
+    this.materials = materialsOf(mesh.material.map, albedo, normalMap);
     this.names = Object.keys(this.materials);
     this.wires = wiresOf(mesh);
     this.show("Textured");
@@ -43,15 +43,15 @@ function ramp(weight) {
   return RAMP[step].clone().lerp(RAMP[step + 1], place - step);
 }
 
-function materialsOf({ map, normalMap, normalScale }, albedo) {
+function materialsOf(map, albedo, normalMap) {
   const pushedBack = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
-  const clay = { color: CLAY, normalMap, normalScale, roughness: 0.9 };
+  const clay = { color: CLAY, normalMap, roughness: 0.9 };
   return {
     Textured: new THREE.MeshBasicMaterial({ map }), // light is in the texture
     Clay: new THREE.MeshStandardMaterial(clay),
     Wireframe: new THREE.MeshStandardMaterial({ ...clay, color: 0xe9e6e1, ...pushedBack }),
     Weights: new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 1 }),
-    ...(albedo && { Albedo: new THREE.MeshLambertMaterial({ map: albedo, normalMap, normalScale }) }),
+    ...(albedo && { Albedo: new THREE.MeshLambertMaterial({ map: albedo, normalMap }) }),
   };
 }
 

@@ -19,7 +19,7 @@ export async function main(bytes, recording, levels) {
     avatar,
     stage,
     recording,
-    looks: new Looks(avatar.mesh, avatar.albedo),
+    looks: new Looks(avatar.mesh, avatar.albedo, avatar.normalMap),
     photographs: new Photographs(find("photograph"), find("caption"), recording.fps),
     skeleton: new THREE.SkeletonHelper(avatar.root),
     axes: new THREE.AxesHelper(0.15),
