@@ -19,6 +19,8 @@ from hnerf.geometry.mesh_queries import Surface
 SMOOTHING_M = (0.06, 0.04, 0.028, 0.02, 0.014, 0.01, 0.007, 0.005)  # from a limb's width to the mesh's own edges
 COSINES = 0.3, 0.7  # between the normals of matched points: from no trust to full trust
 FARTHEST_M = 0.06  # typical of hair and loose clothes; a match much farther away is no match
+DISTRUSTS = 2  # times that matches are looked for that make faces cross
+RINGS = 2  # of faces around crossing ones that are not trusted either
 LOOSEN_STEPS = 12
 LOOSEN_M = 0.0005  # step by which faces that cross each other retreat into the body
 LOOSEN_SMOOTHING_M = 0.002
@@ -39,16 +41,23 @@ def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
 
     A match is trusted by the angle between its normals, and by its distance (Geman-McClure). A vertex in the middle of
     its limb is equally close to the limb's other side, so the scale is half the thickness there, FARTHEST_M at most.
-    This leaves fingers as they are where the field has a mitten.
+    This leaves fingers as they are where the field has a mitten. Matches that make faces cross, as around the eyes, are
+    not trusted, unless the body's own faces do, as at the toes: these are drawn into the body.
     """
     body_m, faces = body.rig.vertices_m.double().numpy(), body.rig.faces.numpy()
     plate, surface = ThinPlate.of(body_m, faces), Surface(target)
     scale_m = np.minimum(_thickness_m(body_m, faces) / 2, FARTHEST_M)
     moved_m, trust = body_m, np.zeros(len(body_m))
+    matched_m, skin = body_m, faces[: body.skin_faces]
     for smoothing_m in SMOOTHING_M:
         matched_m, trust = _match(moved_m, faces, surface, scale_m)
         trust[body.hidden] = 0
         moved_m = body_m + plate.solver(trust, smoothing_m)(matched_m - body_m)
+    own = _around(skin[crossing_faces(body_m, skin)], faces)
+    for _ in range(DISTRUSTS):
+        crossing = _around(skin[crossing_faces(moved_m, skin)], faces)
+        trust[np.setdiff1d(crossing, own)] = 0
+        moved_m = body_m + plate.solver(trust, SMOOTHING_M[-1])(matched_m - body_m)
     return Registration(_loosened(moved_m, faces, body.skin_faces, plate), trust, plate)
 
 
@@ -68,6 +77,14 @@ def _match(
     cosine = (normals_of(vertices_m, faces) * surface.mesh.face_normals[face]).sum(1)
     aligned = ((cosine - COSINES[0]) / (COSINES[1] - COSINES[0])).clip(0, 1)
     return closest_m, aligned / (1 + (distance_m / scale_m) ** 2) ** 2
+
+
+def _around(chosen: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the corners of faces chosen (n, 3) out of faces (F, 3), and of RINGS of faces around them, (m,)."""
+    near = np.unique(chosen)
+    for _ in range(RINGS):
+        near = np.unique(faces[np.isin(faces, near).any(1)])
+    return near
 
 
 def _thickness_m(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:

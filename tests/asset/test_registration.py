@@ -1,11 +1,13 @@
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
+from hnerf.asset import registration
 from hnerf.asset.plate import ThinPlate
-from hnerf.asset.registration import _loosened, _match, crossing_faces, register
+from hnerf.asset.registration import _around, _loosened, _match, crossing_faces, register
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.body.base_mesh import BaseMesh, base_mesh
 from hnerf.geometry.mesh_queries import Surface
@@ -64,6 +66,44 @@ def test_two_fingers_stay_apart_in_a_mitten() -> None:
     assert 0.0015 < gap_m < 0.0045
     back = np.abs(found.vertices_m - middle_m) < (0.012, 1, 0.01)
     assert np.abs(found.vertices_m[back.all(1), 1]).max() > 0.01  # finger backs moved onto the mitten's back
+
+
+def test_a_match_that_makes_faces_cross_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One vertex on the column's side is matched with a point beyond the opposite side. It stays with its neighbours,
+    on the surface of 17 cm radius."""
+    body = base_mesh(column_rig())
+    vertices_m, faces = body.rig.vertices_m.numpy(), body.rig.faces.numpy()
+    stray = int(np.linalg.norm(vertices_m - (0.15, 0, 0.8), axis=1).argmin())
+
+    def with_a_stray(*given: Any) -> tuple[np.ndarray, np.ndarray]:
+        matched_m, trust = _match(*given)
+        matched_m[stray], trust[stray] = (-0.4, 0, 0.8), 1
+        return matched_m, trust
+
+    monkeypatch.setattr(registration, "_match", with_a_stray)
+    found = register(body, upright_column(0.17, -0.02, 1.62))
+    assert not crossing_faces(found.vertices_m, faces[: body.skin_faces]).any()
+    assert found.trust[stray] == 0
+    side = np.linalg.norm(vertices_m[:, :2], axis=1) > 0.1
+    assert found.trust[side & (np.abs(np.abs(vertices_m[:, 2] - 0.8) - 0.55) < 0.05)].min() > 0.7
+    assert np.linalg.norm(found.vertices_m[stray, :2]) == pytest.approx(0.17, abs=0.003)
+
+
+def test_matches_are_trusted_where_the_bodys_own_faces_cross(monkeypatch: pytest.MonkeyPatch) -> None:
+    boxes = twice(trimesh.creation.box(extents=(0.02, 0.02, 0.02)).subdivide(), (0.0195, 0.001, 0.001))
+    around = trimesh.creation.box(bounds=boxes.bounds).subdivide().subdivide()
+    trust = register(bare(boxes), around).trust
+    monkeypatch.setattr(registration, "DISTRUSTS", 0)
+    np.testing.assert_array_equal(trust, register(bare(boxes), around).trust)
+    assert trust[np.unique(boxes.faces[crossing_faces(boxes.vertices, boxes.faces)])].max() > 0.5
+
+
+def test_rings_of_faces_are_counted_from_shared_corners() -> None:
+    """In a strip of triangles 012, 123, 234 and so on, the first one has corners 0 to 2; faces with one of them reach
+    corner 4, and those around them corner 6."""
+    strip = np.arange(10)[:, None] + np.arange(3)
+    assert _around(strip[:1], strip).tolist() == [0, 1, 2, 3, 4, 5, 6]
+    assert _around(strip[:0], strip).tolist() == []
 
 
 def test_intersecting_faces_are_pulled_apart() -> None:
