@@ -234,13 +234,15 @@ def define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, stage_from_w
     """Define a pinhole camera in USD's conventions: it looks along -Z, apertures and focal length are in tenths of a
     scene unit.
 
-    Pixel centres are at integers here, so the principal point lies (cx + 1/2) / W across the image.
+    Pixel centres are at integers here, so the principal point lies (cx + 1/2) / W across the image. The custom data has
+    the image's size, for which USD has no attribute.
     """
     (fx, _, cx), (_, fy, cy), _ = camera.K
     focal = APERTURE * fx / camera.width_px
     vertical_aperture = focal * camera.height_px / fy
     prim = UsdGeom.Camera.Define(stage, path)
     prim.GetPrim().SetDisplayName(camera.name)
+    prim.GetPrim().SetCustomData({"imageWidth": camera.width_px, "imageHeight": camera.height_px})
     prim.CreateFocalLengthAttr(focal)
     prim.CreateHorizontalApertureAttr(APERTURE)
     prim.CreateVerticalApertureAttr(vertical_aperture)

@@ -22,6 +22,7 @@ def test_usd_camera_parameters_by_hand() -> None:
     # 0.36 (1/2 - 300.5 / 640) and 0.3375 (200.5 / 480 - 1/2)
     assert camera.GetHorizontalApertureOffsetAttr().Get() == pytest.approx(0.01096875)
     assert camera.GetVerticalApertureOffsetAttr().Get() == pytest.approx(-0.0277734375)
+    assert [camera.GetPrim().GetCustomDataByKey(side) for side in ("imageWidth", "imageHeight")] == [640, 480]
     pose = np.array(UsdGeom.Xformable(camera).GetLocalTransformation())
     # It stands at world (0, -3, 1) = stage (0, 1, 3) and looks along world +y = stage -z: USD's own camera axes.
     np.testing.assert_allclose(pose, [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 1, 3, 1]], atol=1e-12)
