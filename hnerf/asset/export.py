@@ -285,8 +285,8 @@ def write_files(out: Path, avatars: Avatars, capture: Capture, info: AssetInfo, 
     write_package(out, avatars, cameras, capture.fps, info)
     write_usdz(out / "avatar.usdz", avatars, cameras, capture.fps, info)
     write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps, info)
-    write_glb(out / "avatar.glb", staged, staged.rigs[FULL], info.licence)
-    write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME], info.licence)
+    write_glb(out / "avatar.glb", staged, staged.rigs[FULL], info)
+    write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME], info)
     if staged.rates:
         write_avatar_bvh(out / "avatar.bvh", staged)
         write_avatar_trc(out / "avatar.trc", staged)

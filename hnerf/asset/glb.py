@@ -10,6 +10,7 @@ import numpy as np
 import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
+from hnerf.asset.package import AssetInfo
 from hnerf.asset.rigs import JointMotion, StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.skinning import Skin
@@ -73,13 +74,14 @@ class GlbWriter:
         self.document.save_binary(path)
 
 
-def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig, licence: str = "") -> None:
+def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig, info: AssetInfo) -> None:
     """Write a rig of the avatar with all its motions except the resampled ones. Joints are nodes 0 to J-1, the mesh is
-    node J; time 0 is a motion's first instant. Mesh and skin are named as in USD; Blender shows these names. licence:
-    of the asset, if the user gave one; glTF calls it the copyright."""
+    node J; time 0 is a motion's first instant. Mesh and skin are named as in USD; Blender shows these names. glTF calls
+    the licence the copyright."""
     writer = GlbWriter()
     document = writer.document
-    document.asset.copyright = licence or None
+    document.asset.generator, document.asset.copyright = "hnerf", info.licence or None
+    document.asset.extras = {"version": info.version, "captureDigest": info.capture}
     _add_joints(document, rig.skeleton, avatar.joint_names)
     names = [*avatar.blend_shapes_m, *avatar.physiques_m]
     primitive = _primitive(writer, avatar, rig.skin)

@@ -8,12 +8,13 @@ import trimesh
 from hnerf.asset.compact_glb import compact_glb, read_glb
 from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
+from tests.asset.figure import INFO
 from tests.asset.test_glb import accessor
 
 
 def test_compacting_changes_only_the_texture_and_blend_shapes(staged: StagedAvatar, tmp_path: Path) -> None:
     """Blend shapes change by at most half a quantisation step: 1 / 65 536 m, and 1 / 256 for normals."""
-    write_glb(tmp_path / "avatar.glb", staged, staged.rigs["full"])
+    write_glb(tmp_path / "avatar.glb", staged, staged.rigs["full"], INFO)
     (tmp_path / "compact.glb").write_bytes(compact_glb((tmp_path / "avatar.glb").read_bytes(), 32))
     before, after = (pygltflib.GLTF2.load(str(tmp_path / name)) for name in ("avatar.glb", "compact.glb"))
     assert len(before.accessors) == len(after.accessors)
@@ -34,7 +35,7 @@ def test_compacting_changes_only_the_texture_and_blend_shapes(staged: StagedAvat
 
 
 def test_an_image_with_transparency_is_kept(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_glb(tmp_path / "avatar.glb", staged, staged.rigs["full"])
+    write_glb(tmp_path / "avatar.glb", staged, staged.rigs["full"], INFO)
     document = pygltflib.GLTF2.load(str(tmp_path / "avatar.glb"))
     png = cv2.imencode(".png", np.full((8, 8, 4), 100, np.uint8))[1].tobytes()
     view = document.bufferViews[document.images[0].bufferView]

@@ -19,7 +19,7 @@ from hnerf.asset.texture import UvLayout
 from hnerf.asset.usd import SKELETON, surface_path
 from hnerf.body.descriptor import normals_of
 from hnerf.body.skeletons import JointNames
-from tests.asset.figure import FRAMES
+from tests.asset.figure import FRAMES, INFO
 
 KHRONOS = """
 const fs = require("fs"), validator = require("gltf-validator");
@@ -39,14 +39,16 @@ def rig(request: pytest.FixtureRequest) -> str:
 def glb(rig: str, staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the glTF file of a rig."""
     path = tmp_path_factory.mktemp("glb") / "avatar.glb"
-    write_glb(path, staged, staged.rigs[rig])
+    write_glb(path, staged, staged.rigs[rig], INFO)
     return path
 
 
-def test_a_licence_is_the_copyright(staged: StagedAvatar, tmp_path: Path) -> None:
+def test_the_file_says_what_the_asset_is(staged: StagedAvatar, tmp_path: Path) -> None:
     for licence in ("CC-BY-4.0", ""):
-        write_glb(tmp_path / "avatar.glb", staged, staged.rigs["game"], licence)
-        assert pygltflib.GLTF2().load(tmp_path / "avatar.glb").asset.copyright == (licence or None)
+        write_glb(tmp_path / "avatar.glb", staged, staged.rigs["game"], dataclasses.replace(INFO, licence=licence))
+        asset = pygltflib.GLTF2().load(tmp_path / "avatar.glb").asset
+        assert (asset.generator, asset.copyright) == ("hnerf", licence or None)
+        assert asset.extras == {"version": "7", "captureDigest": "0123abcd"}
 
 
 def accessor(document: pygltflib.GLTF2, index: int) -> np.ndarray:
@@ -143,7 +145,7 @@ def test_nodes_have_the_joint_names_of_the_asset(
     joint_names: JointNames, names: list[str], staged: StagedAvatar, tmp_path: Path
 ) -> None:
     renamed = dataclasses.replace(staged, joint_names=joint_names)
-    write_glb(tmp_path / "avatar.glb", renamed, renamed.rigs["full"])
+    write_glb(tmp_path / "avatar.glb", renamed, renamed.rigs["full"], INFO)
     nodes = pygltflib.GLTF2.load(str(tmp_path / "avatar.glb")).nodes
     assert [node.name for node in nodes] == [*names, "upper_L", "Surface"]
 
@@ -160,7 +162,7 @@ def test_a_normal_map_comes_with_tangents(glb: Path, staged: StagedAvatar) -> No
 
 def test_a_normal_map_and_an_albedo_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:
     bare = dataclasses.replace(staged, normal_map=None, albedo=None)
-    write_glb(tmp_path / "smooth.glb", bare, staged.rigs["full"])
+    write_glb(tmp_path / "smooth.glb", bare, staged.rigs["full"], INFO)
     document = pygltflib.GLTF2.load(str(tmp_path / "smooth.glb"))
     assert document.meshes[0].primitives[0].attributes.TANGENT is None
     assert document.extensionsUsed == [UNLIT] and len(document.materials) == 1
@@ -233,7 +235,7 @@ def test_weights_that_stay_zero_have_two_keys(staged: StagedAvatar, tmp_path: Pa
         name: dataclasses.replace(motion, shape_weights=0 * motion.shape_weights)
         for name, motion in full.motions.items()
     }
-    write_glb(tmp_path / "still.glb", staged, dataclasses.replace(full, motions=still))
+    write_glb(tmp_path / "still.glb", staged, dataclasses.replace(full, motions=still), INFO)
     document = pygltflib.GLTF2.load(str(tmp_path / "still.glb"))
     *_, joint, weights = document.animations[0].samplers
     np.testing.assert_allclose(accessor(document, weights.input)[:, 0], [0, 0.5])
@@ -249,7 +251,7 @@ def test_a_joint_that_one_motion_moves_is_put_back_by_the_others(staged: StagedA
     quaternions = captured.quaternions.copy()
     quaternions[:, 2] = rest
     motions = {"captured": captured, "stiff": dataclasses.replace(captured, quaternions=quaternions)}
-    write_glb(tmp_path / "two.glb", staged, dataclasses.replace(full, motions=motions))
+    write_glb(tmp_path / "two.glb", staged, dataclasses.replace(full, motions=motions), INFO)
     document = pygltflib.GLTF2.load(str(tmp_path / "two.glb"))
     moved, stiff = ([(c.target.node, c.target.path) for c in a.channels] for a in document.animations)
     assert moved == stiff

@@ -23,7 +23,7 @@ from hnerf.evaluation.pictures import cast_pixels
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.models import THREE_SHA256, has_model
 from tests.asset.browser import Page, browser, found_browser
-from tests.asset.figure import FRAMES, capture, side_camera
+from tests.asset.figure import FRAMES, INFO, capture, side_camera
 from tests.asset.pages import with_joints_in_second_set
 
 NEEDS_THREE = pytest.mark.skipif(
@@ -51,7 +51,7 @@ def viewer(staged: StagedAvatar, photographed: Capture, tmp_path_factory: pytest
     glb, full = folder / "avatar.glb", staged.rigs["full"]
     fast = dataclasses.replace(full.motions["captured"], fps=30.0, codes=np.arange(4.0))
     full = dataclasses.replace(full, motions=full.motions | {"fast": fast})
-    write_glb(glb, staged, full)
+    write_glb(glb, staged, full, INFO)
     glb.write_bytes(with_joints_in_second_set(glb.read_bytes()))
     written = write_viewer(folder / "viewer.html", glb, photographed, staged.stage_from_world, staged.levels)
     assert written == "viewer.html"
