@@ -441,6 +441,8 @@ FAULTS = (
     Fault("photographs-slope", "asset/photographs", "TOLERANCE_M / cosine.clip(0.1)", "TOLERANCE_M"),
     Fault("photographs-gain", "asset/photographs", "pixels_px) / gain", "pixels_px) * gain"),
     Fault("correctives-turn", "asset/correctives", "solve(turn, surface_m", "solve(turn.mT, surface_m"),
+    Fault("eyelids-brows", "asset/eyelids", "(*BLINKS, *BROWS)]", "BLINKS]"),
+    Fault("eyelids-closed", "asset/eyelids", "areas_m2[1] / areas_m2[0]", "areas_m2[0] / areas_m2[1]"),
     Fault("plate-gaps", "asset/plate", "self.bending + self.gaps", "self.bending"),
     Fault("plate-mass", "asset/plate", "diags_array(1 / area_m2)", "diags_array(1e9 * area_m2)"),
     Fault("plate-barycentric", "asset/plate", "-hits.barycentric[vertex]", "-hits.barycentric[vertex][:, ::-1]"),

@@ -1,11 +1,13 @@
 """The asset's textures, from the field's colours and the training photographs: with the recording's light and without
 it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from hnerf.asset.albedo import Albedo, AlbedoBlend, mean_irradiance
+from hnerf.asset.eyelids import with_plain_lids
 from hnerf.asset.field_colours import field_colours
 from hnerf.asset.light import fit_light
 from hnerf.asset.photographs import CapturedBlend, SeenSurface, photographed_texels, sampled
@@ -49,20 +51,27 @@ def baked_textures(
     texture_px: int,
     settings: AssetSettings,
     cavities: np.ndarray,
+    face_units_m: Mapping[str, np.ndarray],
 ) -> tuple[np.ndarray, Albedo | None, Filled]:
     """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, its albedo, None if the texture is the field's
     alone, and what the field fills.
 
     surfaces_m (n, V, 3): the body's surface in the world in each frame; texture_px: side of the texture; cavities (V,)
-    bool: vertices deep inside mouth and nose, which are darkened because little light reaches them.
+    bool: vertices deep inside mouth and nose, which are darkened because little light reaches them; face_units_m: how
+    expressions move the vertices (V, 3), by name, from which the eyelids are known.
     """
     texels, faces = rasterise(layout, texture_px), clothed.rig.faces.numpy()
     lit = texels.interpolate(np.where(cavities, CAVITY_BRIGHTNESS, 1.0)[:, None], faces)
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
+
+    def finished(colours: np.ndarray) -> np.ndarray:
+        shown = with_plain_lids(colours, texels, clothed.rig, face_units_m)
+        return texture_image(texels, shown * lit, texture_px)
+
     if not settings.photograph_frames:
         field = field_colours(avatar, posed, texels, cavities)
         filled = Filled.of(texels, np.ones(len(field), bool), texture_px)
-        return texture_image(texels, field * lit, texture_px), None, filled
+        return finished(field), None, filled
     field = _coarse_field_colours(avatar, posed, layout, texels, texture_px, cavities)
     frames = photographed_frames(capture, settings.photograph_frames, texture_px)
     photographed = {frame: SeenSurface.of(surfaces_m[clothed.index(frame)], faces) for frame in frames}
@@ -73,12 +82,8 @@ def baked_textures(
     for seen in photographed_texels(capture, avatar.gains, photographed, texels):
         captured.add(seen)
         albedo.add(seen)
-
-    def finished(blend: CapturedBlend | AlbedoBlend) -> np.ndarray:
-        return texture_image(texels, blend.colours() * lit, texture_px)
-
     blends: list[CapturedBlend | AlbedoBlend] = [captured, albedo]
-    texture, delit = side_by_side(finished, blends)
+    texture, delit = side_by_side(lambda blend: finished(blend.colours()), blends)
     return texture, Albedo(delit, light), Filled.of(texels, captured.unseen, texture_px)
 
 

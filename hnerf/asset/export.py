@@ -193,7 +193,15 @@ def _mesh_asset(
         photographed_m = [surface.surfaces_m[surface.body.index(frame)] for frame in frames]
         size, layout = texture_size(capture, photographed_m, mesh, settings.texture_px)
         texture, albedo, filled = baked_textures(
-            capture, timeless, surface.body, surface.surfaces_m, layout, size.px, settings, mesh.cavities
+            capture,
+            timeless,
+            surface.body,
+            surface.surfaces_m,
+            layout,
+            size.px,
+            settings,
+            mesh.cavities,
+            mesh.face_units_m,
         )
     with timed("normal map", seconds, log):
         px = settings.normal_map_px

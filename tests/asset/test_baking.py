@@ -62,7 +62,7 @@ def test_the_albedo_of_a_uniform_column_is_uniform(pictures: dict[int, np.ndarra
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
     texture, albedo, _ = baked_textures(
-        capture, Grey(body), body, surfaces_m, layout, 64, SETTINGS, figure.no_cavities(body)
+        capture, Grey(body), body, surfaces_m, layout, 64, SETTINGS, figure.no_cavities(body), {}
     )
     assert albedo is not None
     light = albedo.light.coefficients / albedo.light.coefficients[0]
@@ -79,7 +79,9 @@ def test_the_field_fills_what_no_photograph_shows(pictures: dict[int, np.ndarray
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
     settings = SETTINGS.model_copy(update={"photograph_frames": 1})
-    *_, filled = baked_textures(capture, Grey(body), body, surfaces_m, layout, 64, settings, figure.no_cavities(body))
+    *_, filled = baked_textures(
+        capture, Grey(body), body, surfaces_m, layout, 64, settings, figure.no_cavities(body), {}
+    )
     (frame,), faces, texels = photographed_frames(capture, 1, 64), body.rig.faces.numpy(), rasterise(layout, 64)
     corners_m = surfaces_m[body.index(frame)][faces]
     normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
@@ -95,7 +97,7 @@ def test_there_is_no_albedo_without_photographs() -> None:
     layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
     settings = SETTINGS.model_copy(update={"photograph_frames": 0})
     texture, albedo, filled = baked_textures(
-        figure.capture(), Grey(body), body, np.zeros(0), layout, 64, settings, figure.no_cavities(body)
+        figure.capture(), Grey(body), body, np.zeros(0), layout, 64, settings, figure.no_cavities(body), {}
     )
     assert albedo is None and texture.shape == (64, 64, 3) and filled.share == 1
 
@@ -111,11 +113,35 @@ def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
     for photographs in (0, 3):
         settings, shown = SETTINGS.model_copy(update={"photograph_frames": photographs}), []
         for cavities in (figure.no_cavities(body), vertices_m[:, 2] > 0.85):
-            texture, *_ = baked_textures(capture, Grey(body), body, surfaces_m, layout, 64, settings, cavities)
+            texture, *_ = baked_textures(capture, Grey(body), body, surfaces_m, layout, 64, settings, cavities, {})
             shown.append(texture[texels.row, texels.column, 0].astype(float))
         ratio = shown[1] / shown[0]
         assert np.median(ratio[z_m.min(1) > 0.85]) == pytest.approx(CAVITY_BRIGHTNESS, abs=0.05)
         np.testing.assert_allclose(ratio[z_m.max(1) < 0.6], 1, atol=0.02)
+
+
+def test_both_looks_have_plain_eyelids(pictures: dict[int, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+    body, units_m = figure.bending_body(), {"eyeBlinkLeft": np.zeros((1, 3))}
+    layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
+    capture = Pictured(**vars(figure.capture()), pictures=pictures)
+
+    def black(colours: np.ndarray, *given: object) -> np.ndarray:
+        assert given[-1] is units_m
+        return 0 * colours
+
+    monkeypatch.setattr("hnerf.asset.baking.with_plain_lids", black)
+    texture, albedo, _ = baked_textures(
+        capture,
+        Grey(body),
+        body,
+        body.vertices_m().double().numpy(),
+        layout,
+        64,
+        SETTINGS,
+        figure.no_cavities(body),
+        units_m,
+    )
+    assert albedo is not None and not texture.any() and not albedo.texture.any()
 
 
 def test_many_cameras_or_a_large_texture_take_fewer_frames() -> None:
