@@ -453,6 +453,7 @@ FAULTS = (
     Fault("registration-loosen", "asset/registration", "= -LOOSEN_M *", "= LOOSEN_M *"),
     Fault("quads-order", "asset/quads", "for k in (1, 2, 0)", "for k in (2, 1, 0)"),
     Fault("eye-size", "body/base_mesh", "scale = np.sqrt(", "scale = 2 * np.sqrt("),
+    Fault("regions-head", "asset/regions", '[crossing[:, 0]] == "head"', '[crossing[:, 0]] != "head"'),
     Fault("regions-limit", "asset/regions", "1e3 * surface.closest", "surface.closest"),
     Fault("colours-off-surface", "asset/field_colours", "<= OFF_SURFACE_M", "<= 1.0"),
     Fault("colours-median", "asset/field_colours", "for k in (seen - 1, seen)", "for k in (seen, seen)"),

@@ -22,7 +22,7 @@ from hnerf.asset.figures import beyond_skinning_mm, level_figures, mesh_figures,
 from hnerf.asset.glb import write_glb
 from hnerf.asset.normal_map import normal_map
 from hnerf.asset.package import AssetInfo, Avatars, write_cache, write_package, write_splats, write_usdz
-from hnerf.asset.regions import chosen_topology, findings, surface_distances_mm
+from hnerf.asset.regions import chosen_topology, crossing_findings, findings, surface_distances_mm
 from hnerf.asset.report import write_report
 from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.splat_ply import write_splat_ply
@@ -114,6 +114,7 @@ def export_asset(
     meshes = _rest_meshes(avatar, settings, seconds)
     topology = chosen_topology(settings.topology, meshes.distances_mm["registered"])
     found = findings(settings.topology, meshes.distances_mm["registered"])
+    found += crossing_findings(meshes.by_topology[topology])
     for line in found:
         log.warning("%s: %s", capture.name, line)
     asset, captured = _mesh_asset(capture, masks, avatar, meshes, topology, settings, added), None

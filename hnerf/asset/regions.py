@@ -5,7 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 import trimesh
 
+from hnerf.asset.registration import crossing_faces
 from hnerf.asset.topologies import AssetMesh
+from hnerf.body.rig import Rig
 from hnerf.evaluation.geometry import outer_samples
 from hnerf.geometry.mesh_queries import Surface
 
@@ -34,8 +36,7 @@ def surface_distances_mm(dense: trimesh.Trimesh, meshes: Mapping[str, AssetMesh]
     points_m, _ = outer_samples(Surface(dense), SAMPLES, np.random.default_rng(0))
     surfaces = {name: Surface(mesh.trimesh) for name, mesh in meshes.items()}
     rig, (_, face) = meshes["registered"].rig, surfaces["registered"].closest(points_m)
-    vertex_region = np.array([region_of(name) for name in rig.joint_names])[rig.dense_weights.argmax(1).numpy()]
-    region = vertex_region[surfaces["registered"].mesh.faces[face][:, 0]]
+    region = _vertex_regions(rig)[surfaces["registered"].mesh.faces[face][:, 0]]
     found: dict[str, Distances] = {}
     for name, surface in surfaces.items():
         distance_mm = 1e3 * surface.closest(points_m)[0]
@@ -62,6 +63,19 @@ def findings(wanted: str, registered_mm: Distances) -> list[str]:
         f"loose clothes or long hair? {captured}"
         for region in (_not_followed(registered_mm) if wanted != "captured" else [])
     ]
+
+
+def crossing_findings(mesh: AssetMesh) -> list[str]:
+    """Return a line if faces of the head cross others, as at the eyes, where this leaves holes."""
+    skin = mesh.rig.faces.numpy()[: mesh.skin_faces]
+    crossing = skin[crossing_faces(mesh.trimesh.vertices, skin)]
+    count = int((_vertex_regions(mesh.rig)[crossing[:, 0]] == "head").sum())
+    return [f"head: {count} faces cross others; look for holes in the clay images of report.html"] if count else []
+
+
+def _vertex_regions(rig: Rig) -> np.ndarray:
+    """Return the region of each vertex, that of its strongest joint, (V,)."""
+    return np.array([region_of(name) for name in rig.joint_names])[rig.dense_weights.argmax(1).numpy()]
 
 
 def _not_followed(registered_mm: Distances) -> list[str]:

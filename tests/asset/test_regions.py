@@ -2,12 +2,21 @@ import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 
 from hnerf.asset.correctives import as_they_are
-from hnerf.asset.regions import LIMIT_MM, _summary, chosen_topology, findings, region_of, surface_distances_mm
+from hnerf.asset.regions import (
+    LIMIT_MM,
+    _summary,
+    chosen_topology,
+    crossing_findings,
+    findings,
+    region_of,
+    surface_distances_mm,
+)
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.topologies import AssetMesh
-from tests.asset.figure import column_rig, upright_column
+from tests.asset.figure import column_rig, twice, upright_column
 
 
 @pytest.mark.parametrize(
@@ -59,6 +68,15 @@ def test_a_region_exactly_at_the_limit_is_not_reported() -> None:
 )
 def test_only_auto_falls_back_to_the_captured_mesh(wanted: str, chosen: str) -> None:
     assert chosen_topology(wanted, {"legs": {"mean": 1.0, "p95": LIMIT_MM + 0.1}}) == chosen
+
+
+@pytest.mark.parametrize(("joint", "found"), [("neck01", True), ("foot.L", False)])
+def test_faces_of_the_head_that_cross_are_reported(joint: str, found: bool) -> None:
+    """Of two boxes that overlap by half a millimetre, 22 of 24 faces..."""
+    boxes = twice(trimesh.creation.box(extents=(0.02, 0.02, 0.02)), (0.0195, 0.001, 0.001))
+    rig = clothed_rig(dataclasses.replace(column_rig(), joint_names=(joint, "toe1-1.L")), boxes)
+    lines = crossing_findings(AssetMesh(rig, as_they_are, len(boxes.faces), None))
+    assert [line.startswith("head: 10 faces cross others") for line in lines] == [True] * found
 
 
 def test_mean_and_95th_percentile() -> None:
