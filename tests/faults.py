@@ -372,6 +372,7 @@ FAULTS = (
     Fault("resampled-start", "asset/motions", "np.ceil(first - 1e-6)", "np.floor(first)"),
     Fault("bones-front", "asset/skeleton", "UP if _points_to_front(name) else FRONT",
           "FRONT if _points_to_front(name) else UP"),
+    Fault("same-axes", "asset/skeleton", "    full.rotations[game.sources + 1] = game.rotations\n", ""),
     Fault("game-toes", "asset/skeleton", 'toe = f"middle_toe_01_', 'toe = f"no_toe_01_'),
     Fault("folded-weights", "asset/skinning", "joints = taken_by[self.joints]", "joints = self.joints"),
     Fault("game-negative", "asset/skinning", "(found >= 0).all(1) & ", ""),

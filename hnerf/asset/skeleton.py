@@ -65,11 +65,15 @@ class Skeleton:
 
 
 def full_skeleton(joints: tuple[str, ...], parents: np.ndarray, positions_m: np.ndarray, bones: Bones) -> Skeleton:
-    """Return the skeleton of a body model: joints (S,), parents (S,), at rest at positions_m (S, 3)."""
+    """Return the skeleton of a body model: joints (S,), parents (S,), at rest at positions_m (S, 3). Joints that the
+    game skeleton has, too, have the axes that they have there."""
     names = (ROOT, *map(exported_name, joints))
     below = np.concatenate([[-1], parents + 1])
     at_m = np.concatenate([np.zeros((1, 3)), positions_m])
-    return Skeleton(names, below, np.arange(-1, len(joints)), at_m, _rotations(names, below, at_m, bones))
+    full = Skeleton(names, below, np.arange(-1, len(joints)), at_m, _rotations(names, below, at_m, bones))
+    game, _ = game_skeleton(full, bones)
+    full.rotations[game.sources + 1] = game.rotations
+    return full
 
 
 def game_skeleton(full: Skeleton, bones: Bones) -> tuple[Skeleton, np.ndarray]:

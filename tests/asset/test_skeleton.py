@@ -37,6 +37,17 @@ def test_joint_y_axes_point_along_their_bones(rig: Rig) -> None:
     np.testing.assert_array_equal(skeleton.rotations[0], np.eye(3))
 
 
+def test_joints_of_both_skeletons_have_the_same_axes(rig: Rig) -> None:
+    """The clavicle points to the arm, past the shoulder between them, which the game skeleton lacks."""
+    full = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "along")
+    game, _ = game_skeleton(full, "along")
+    clavicle, arm = (full.names.index(name) for name in ("clavicle_L", "upperarm_L"))
+    bone = full.positions_m[arm] - full.positions_m[clavicle]
+    np.testing.assert_allclose(full.rotations[clavicle, :, 1], bone / np.linalg.norm(bone), atol=1e-6)
+    for name, axes in zip(game.names, game.rotations, strict=True):
+        np.testing.assert_allclose(full.rotations[full.names.index(name)], axes, atol=1e-12)
+
+
 def test_identity_axes_have_no_rotation(rig: Rig) -> None:
     skeleton = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "identity")
     np.testing.assert_array_equal(skeleton.rotations, np.tile(np.eye(3), (105, 1, 1)))
