@@ -34,7 +34,7 @@ def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
     return settings.source in ("network", "both") or (settings.source is None and (silent or flat))
 
 
-@stage("hands", version="3", networks=(HAND_LANDMARKS,))
+@stage("hands", version="4", networks=(HAND_LANDMARKS,))
 def find_hands(out: Path, recording: Artifact) -> dict[str, float]:
     """Write the recording with points of the subject's hands. Return the lowest share of hands found in any camera."""
     return {"least_found": min(detect_hands(Capture.load(recording.root), out).values())}
