@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("detection", version="8", resumable=True)
+@stage("detection", version="9", resumable=True)
 def detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[str, float]:
     """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
     finished."""

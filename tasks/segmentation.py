@@ -14,7 +14,7 @@ from tasks.store import Artifact
 EDGE_MOVEMENT = "moved_px"
 
 
-@stage("segmentation", version="16")
+@stage("segmentation", version="17")
 def segment(
     out: Path,
     recording: Artifact,

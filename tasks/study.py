@@ -23,7 +23,7 @@ from tasks.store import Artifact
 EXTREME_POSES = 3  # checked for each strength and seed
 
 
-@stage("study-capture", version="6")
+@stage("study-capture", version="7")
 def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) -> dict[str, float]:
     """Write a degraded capture in the format that `ingest` writes."""
     degradation.apply(Capture.load(recording.root), out=out)
@@ -42,7 +42,7 @@ def degrade_clothing(
     return {}
 
 
-@stage("study-masks", version="2")
+@stage("study-masks", version="3")
 def degrade_masks(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact, degradation: Degradation
 ) -> dict[str, float]:

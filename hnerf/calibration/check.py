@@ -51,8 +51,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     """
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
-    subject = ranked_people(capture)[0]
-    keypoints = subject.keypoints
+    keypoints = ranked_people(capture)[0].keypoints
     empty = [name for name, seen in zip(capture.train_cameras, keypoints, strict=True) if not seen[..., 2].any()]
     if empty:
         return _without(empty, capture, settings)
@@ -88,7 +87,8 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         raise InputError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
     held_out_px |= refinement.held_out_px
-    notes += [*_side_notes(capture, subject.exchanged), *refinement.notes]
+    exchanged = ranked_people(synchronised.with_cameras(every))[0].exchanged
+    notes += [*_side_notes(synchronised, exchanged), *refinement.notes]
     notes += _height_notes(after.body_height_m, capture.stature_m)
     return CalibrationReport(
         cameras=every,
@@ -171,7 +171,7 @@ def _check_height(capture: Capture, found: Measure) -> None:
 def _side_notes(capture: Capture, exchanged: Sequence[int]) -> list[str]:
     """Return a note on each camera with images in which left and right were exchanged, by their number, and log it."""
     notes = [
-        f"camera {name}: left and right of arms, legs or ears were exchanged in {count} of {len(capture.frames)} "
+        f"camera {name}: left and right of arms or legs were exchanged in {count} of {len(capture.frames)} "
         "images, and are put right"
         for name, count in zip(capture.train_cameras, exchanged, strict=False)
         if count

@@ -176,8 +176,8 @@ def _drift_apart(times_s: Sequence[np.ndarray]) -> bool:
     if len({len(stamps) for stamps in times_s}) != 1:
         return False
     lasts_s = np.array([stamps[-1] - stamps[0] for stamps in times_s])
-    apart_s = np.abs(lasts_s - lasts_s[0])
-    return bool(apart_s.max() > IRREGULAR * _step_s(times_s[0]) and (apart_s <= RATE_TOLERANCE * lasts_s).all())
+    apart_s = np.ptp(lasts_s)
+    return bool(IRREGULAR * _step_s(times_s[0]) < apart_s <= RATE_TOLERANCE * lasts_s.max())
 
 
 def _unevenness_s(times_s: np.ndarray) -> float:

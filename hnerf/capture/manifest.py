@@ -32,7 +32,7 @@ MIN_KEY_SIMILARITY = 0.8  # of an unknown key to a known one (difflib), from whi
 MAX_BYTES = 65_536
 NAMED_BY, NUMBER = "nearest", r"\s*(-?\d{1,9}(?:\.\d*)?)\s*"
 SUBJECT = re.compile(rf"nearest to \({NUMBER},{NUMBER}\)(?: in (.+?)(?: at frame (\d{{1,9}}))?)?")
-RANGE = re.compile(r"\d{1,9}:\d{1,9}(:[1-9]\d{0,8})?")
+RANGE = re.compile(r"[0-9]{1,9}:[0-9]{1,9}(:[1-9][0-9]{0,8})?")
 MAX_RANGE = 1_000_000  # frames: nine hours at 30 a second, and a bound on memory
 NO_FRAME = -1  # of a subject's point without a frame
 MAX_NAME_BYTES = 200  # file systems allow 255, which must also hold longer names made from it
@@ -67,7 +67,10 @@ class FrameSplit(_Table):
         if not 0 < len(numbers) <= MAX_RANGE:
             raise ValueError('give a list of frames, or "FIRST:END" or "FIRST:END:STEP", END excluded')
         trained = set(info.data.get("train", ()))
-        return [frame for frame in numbers if frame not in trained]
+        left = [frame for frame in numbers if frame not in trained]
+        if not left:
+            raise ValueError("all frames of this range are under train; name others")
+        return left
 
 
 TABLES: dict[str, type[_Table]] = {"cameras": CameraSplit, "frames": FrameSplit}

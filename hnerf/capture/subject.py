@@ -38,7 +38,7 @@ def ranked_people(capture: Capture) -> list[PersonTrack]:
     uncalibrated = len(cameras) > 1 and bool((centres_m == centres_m[0]).all())
     subject, *others = _ranked(capture, cameras, people, uncalibrated)
     if len(cameras) > 1 and not uncalibrated:
-        keypoints, exchanged = put_sides_right(cameras, subject.keypoints)
+        keypoints, exchanged = put_sides_right(cameras, subject.keypoints, np.array(capture.frames) / capture.fps)
         subject = subject._replace(keypoints=keypoints, exchanged=tuple(exchanged.sum(1).tolist()))
     return [subject, *others]
 

@@ -24,6 +24,7 @@ from hnerf.side_by_side import side_by_side
 
 SIZE, POINTS = 224, 21
 SIDES = (LEFT_ARM[1], RIGHT_ARM[1])  # elbow and wrist
+WRISTS = [wrist for _, wrist in SIDES]
 REACH, SIDE = 0.45, 1.2  # distance from wrist to middle of the hand, and side of the region, in forearm lengths
 SHORTEST = 0.1  # forearm length in heights of the person: a forearm that points at the camera looks shorter
 PASSES = 2  # the second searches where the first found the hand
@@ -58,7 +59,8 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
 
 
 def given_hands(capture: Capture, camera: str, subject: np.ndarray) -> np.ndarray:
-    """Return the given hands (frames, 2, 21, 3) of the subject, keypoints (frames, 25, 3); 0 where there are none."""
+    """Return the given hands (frames, 2, 21, 3), left and right, of the subject, keypoints (frames, 25, 3); 0 where
+    there are none. Hands go with the wrists of a person whose left and right were exchanged."""
     hands = np.zeros((len(subject), 2, POINTS, 3))
     given, people = capture.given_hands(camera), capture.keypoints(camera)
     if given is None or people is None:
@@ -66,7 +68,9 @@ def given_hands(capture: Capture, camera: str, subject: np.ndarray) -> np.ndarra
     for i, keypoints in enumerate(subject):
         person = nearest_person(keypoints, people[i])
         if person is not None and person < given.shape[1]:  # others were added by a network
-            hands[i] = given[i, person]
+            wrists, as_found = keypoints[WRISTS], people[i][person][WRISTS]
+            exchanged = not np.array_equal(wrists, as_found) and np.array_equal(wrists, as_found[::-1])
+            hands[i] = given[i, person, ::-1] if exchanged else given[i, person]
     return hands
 
 
@@ -125,7 +129,7 @@ def find_hands(image: np.ndarray, keypoints: np.ndarray, network: HandNetwork) -
             hands[hand] = points
     apart_px = float(np.median(np.linalg.norm(hands[0, :, :2] - hands[1, :, :2], axis=-1)))
     if (hands[..., 2] > 0).all() and apart_px < SAME * sides_px.max():
-        wrists = keypoints[[wrist for _, wrist in SIDES], :2]
+        wrists = keypoints[WRISTS, :2]
         hands[np.linalg.norm(hands[:, 0, :2] - wrists, axis=-1).argmax()] = 0
     return hands
 

@@ -72,7 +72,7 @@ def test_only_auto_falls_back_to_the_captured_mesh(wanted: str, chosen: str) -> 
 
 @pytest.mark.parametrize(("joint", "found"), [("neck01", True), ("foot.L", False)])
 def test_faces_of_the_head_that_cross_are_reported(joint: str, found: bool) -> None:
-    """Of two boxes that overlap by half a millimetre, 22 of 24 faces..."""
+    """Two boxes overlap by half a millimetre: 10 of their 24 faces cross faces of the other."""
     boxes = twice(trimesh.creation.box(extents=(0.02, 0.02, 0.02)), (0.0195, 0.001, 0.001))
     rig = clothed_rig(dataclasses.replace(column_rig(), joint_names=(joint, "toe1-1.L")), boxes)
     lines = crossing_findings(AssetMesh(rig, as_they_are, len(boxes.faces), None))

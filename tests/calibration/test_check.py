@@ -211,7 +211,7 @@ def test_a_camera_that_exchanges_left_and_right_is_used_and_named(tmp_path: Path
     report = check_calibration(write_capture(tmp_path, ring(4), seen), SETTINGS)
     assert [verdict.status for verdict in report.verdicts.values()] == ["ok"] * 4
     assert report.notes[0] == (
-        "camera c3: left and right of arms, legs or ears were exchanged in 12 of 12 images, and are put right"
+        "camera c3: left and right of arms or legs were exchanged in 12 of 12 images, and are put right"
     )
 
 

@@ -85,10 +85,13 @@ def test_frames_may_be_ranges(tmp_path: Path) -> None:
     (tmp_path / "capture.toml").write_text('[frames]\ntrain = "1:8:3"\nnovel_pose = "3:7"\n')
     frames = read_manifest(tmp_path).frames
     assert frames is not None and (frames.train, frames.novel_pose) == ([1, 4, 7], [3, 5, 6])
-    for wrong in ("3", "3:", "a:b", "3:3", "0:1000001", "0:9:0", "0:9999999999"):
+    for wrong in ("3", "3:", "a:b", "3:3", "0:1000001", "0:9:0", "0:9999999999", "٣:٩"):
         (tmp_path / "capture.toml").write_text(f'[frames]\ntrain = "{wrong}"\n')
         with pytest.raises(InputError, match=r'frames\.train: give a list of frames, or "FIRST:END"'):
             read_manifest(tmp_path)
+    (tmp_path / "capture.toml").write_text('[frames]\ntrain = "0:5"\nnovel_pose = "1:4"\n')
+    with pytest.raises(InputError, match="all frames of this range are under train; name others"):
+        read_manifest(tmp_path)
 
 
 @pytest.mark.parametrize(("transfer", "hdr"), {"Rec. 709": (1, False), "PQ": (16, True), "HLG": (18, True)}.values())

@@ -162,6 +162,20 @@ def test_a_person_whom_a_network_added_has_no_recorded_hands(tmp_path: Path) -> 
     assert found[:, 0, 0, 0].tolist() == [1, 1, 0, 1, 1]
 
 
+def test_given_hands_go_with_wrists_whose_sides_were_exchanged(tmp_path: Path) -> None:
+    """In frame 3, the subject's wrists are those of the file with left and right exchanged."""
+    capture = ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
+    keypoints = np.tile([12.0, 5, 0.5], (5, 1, 25, 1))
+    keypoints[:, 0, [4, 7], 0] = 11, 13
+    np.savez(capture.root / "keypoints.npz", **{"01": keypoints})
+    hands = np.ones((5, 1, 2, 21, 3))
+    hands[:, :, 1] = 2
+    np.savez(capture.root / "given_hands.npz", **{"01": hands})
+    subject = keypoints[:, 0].copy()
+    subject[3, [4, 7]] = subject[3, [7, 4]]
+    assert given_hands(capture, "01", subject)[:, :, 0, 0].tolist() == [[1, 2], [1, 2], [1, 2], [2, 1], [1, 2]]
+
+
 def test_a_hand_is_searched_for_again_around_where_it_was_found() -> None:
     """The first region's side is 48 px, for a forearm of 40 px; the second's is twice the palm of 60 px."""
     sides_px = []

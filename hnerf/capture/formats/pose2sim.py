@@ -32,8 +32,10 @@ class Pose2Sim(EasyMocap):
 
 
 def camera_tables(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the tables of cameras, those with a matrix, in a file of Pose2Sim or aniposelib; Caliscope adds others."""
-    return {key: table for key, table in read_toml(path).items() if isinstance(table, dict) and "matrix" in table}
+    """Return the tables of cameras, those with a matrix or a rotation, in a file of Pose2Sim or aniposelib; Caliscope
+    adds others."""
+    tables = {key: table for key, table in read_toml(path).items() if isinstance(table, dict)}
+    return {key: table for key, table in tables.items() if table.keys() & {"matrix", "rotation"}}
 
 
 def lenses_from_tables(source: Path, tables: dict[str, dict[str, Any]]) -> dict[str, Lens]:
