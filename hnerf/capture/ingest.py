@@ -311,7 +311,14 @@ def _frame_rate(folder: Path, stated: float | None, filmed: dict[str, Footage], 
 
     A rate stated in `capture.toml` applies to images, and overrides one that all videos share (slow motion). If rates
     differ, the frames of the slowest camera count; raises InputError if the stated rate is not the slowest video's.
+    Warn if nothing states a rate.
     """
+    if not stated and not any(one.fps for one in filmed.values()):
+        log.warning(
+            "%s: images state no frame rate: %g frames a second assumed; if that is wrong, set fps in capture.toml",
+            folder,
+            DEFAULT_FPS,
+        )
     counted = min((one.fps for one in footage.values() if one.fps), default=stated or DEFAULT_FPS)
     most = (1 + RATE_TOLERANCE) * counted
     if all((one.fps or stated or DEFAULT_FPS) <= most for one in filmed.values()):

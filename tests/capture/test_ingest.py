@@ -80,6 +80,17 @@ def test_capture_toml_sets_names_and_splits(folder: Path, tmp_path: Path) -> Non
     assert {p.name[:6] for p in (tmp_path / "out" / "images" / "01").iterdir()} == {"000001", "000003", "000004"}
 
 
+@pytest.mark.parametrize("stated", [False, True])
+def test_images_without_a_frame_rate_get_a_warning(
+    folder: Path, stated: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    if stated:
+        (folder / "capture.toml").write_text("fps = 30\n")
+    ingest(folder, SETTINGS, tmp_path / "out")
+    warning = f"{folder}: images state no frame rate: 30 frames a second assumed; if that is wrong, set fps in"
+    assert (warning in caplog.text) != stated
+
+
 def test_frames_may_be_ranges(tmp_path: Path) -> None:
     """Their ends are excluded, as in Python. A range of novel poses goes around the frames that are trained on."""
     (tmp_path / "capture.toml").write_text('[frames]\ntrain = "1:8:3"\nnovel_pose = "3:7"\n')
@@ -115,6 +126,7 @@ def test_hdr_video_gets_a_warning(
 def test_files_of_uncalibrated_cameras_get_a_warning(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    (folder / "capture.toml").write_text("fps = 30\n")
     with caplog.at_level(logging.WARNING, "hnerf.capture"):
         ingest(folder, SETTINGS, tmp_path / "out")
         assert not caplog.messages
