@@ -19,8 +19,7 @@ from hnerf.geometry.mesh_queries import Surface
 SMOOTHING_M = (0.06, 0.04, 0.028, 0.02, 0.014, 0.01, 0.007, 0.005)  # from a limb's width to the mesh's own edges
 COSINES = 0.3, 0.7  # between the normals of matched points: from no trust to full trust
 FARTHEST_M = 0.06  # typical of hair and loose clothes; a match much farther away is no match
-DISTRUSTS = 2  # times that matches are looked for that make faces cross
-RINGS = 2  # of faces around crossing ones that are not trusted either
+RINGS = 2, 4  # of faces around crossing ones that are not trusted either: at first, and if faces still cross
 LOOSEN_STEPS = 12
 LOOSEN_M = 0.0005  # step by which faces that cross each other retreat into the body
 LOOSEN_SMOOTHING_M = 0.002
@@ -53,10 +52,10 @@ def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
         matched_m, trust = _match(moved_m, faces, surface, scale_m)
         trust[body.hidden] = 0
         moved_m = body_m + plate.solver(trust, smoothing_m)(matched_m - body_m)
-    own = _around(skin[crossing_faces(body_m, skin)], faces)
-    for _ in range(DISTRUSTS):
-        crossing = _around(skin[crossing_faces(moved_m, skin)], faces)
-        trust[np.setdiff1d(crossing, own)] = 0
+    own = skin[crossing_faces(body_m, skin)]
+    for rings in RINGS:
+        crossing = skin[crossing_faces(moved_m, skin)]
+        trust[np.setdiff1d(_around(crossing, faces, rings), _around(own, faces, rings))] = 0
         moved_m = body_m + plate.solver(trust, SMOOTHING_M[-1])(matched_m - body_m)
     return Registration(_loosened(moved_m, faces, body.skin_faces, plate), trust, plate)
 
@@ -79,10 +78,10 @@ def _match(
     return closest_m, aligned / (1 + (distance_m / scale_m) ** 2) ** 2
 
 
-def _around(chosen: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the corners of faces chosen (n, 3) out of faces (F, 3), and of RINGS of faces around them, (m,)."""
+def _around(chosen: np.ndarray, faces: np.ndarray, rings: int) -> np.ndarray:
+    """Return the corners of faces chosen (n, 3) out of faces (F, 3), and of some rings of faces around them, (m,)."""
     near = np.unique(chosen)
-    for _ in range(RINGS):
+    for _ in range(rings):
         near = np.unique(faces[np.isin(faces, near).any(1)])
     return near
 

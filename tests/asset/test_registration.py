@@ -93,7 +93,7 @@ def test_matches_are_trusted_where_the_bodys_own_faces_cross(monkeypatch: pytest
     boxes = twice(trimesh.creation.box(extents=(0.02, 0.02, 0.02)).subdivide(), (0.0195, 0.001, 0.001))
     around = trimesh.creation.box(bounds=boxes.bounds).subdivide().subdivide()
     trust = register(bare(boxes), around).trust
-    monkeypatch.setattr(registration, "DISTRUSTS", 0)
+    monkeypatch.setattr(registration, "RINGS", ())
     np.testing.assert_array_equal(trust, register(bare(boxes), around).trust)
     assert trust[np.unique(boxes.faces[crossing_faces(boxes.vertices, boxes.faces)])].max() > 0.5
 
@@ -102,8 +102,8 @@ def test_rings_of_faces_are_counted_from_shared_corners() -> None:
     """In a strip of triangles 012, 123, 234 and so on, the first one has corners 0 to 2; faces with one of them reach
     corner 4, and those around them corner 6."""
     strip = np.arange(10)[:, None] + np.arange(3)
-    assert _around(strip[:1], strip).tolist() == [0, 1, 2, 3, 4, 5, 6]
-    assert _around(strip[:0], strip).tolist() == []
+    assert _around(strip[:1], strip, 2).tolist() == [0, 1, 2, 3, 4, 5, 6]
+    assert _around(strip[:0], strip, 2).tolist() == []
 
 
 def test_intersecting_faces_are_pulled_apart() -> None:
