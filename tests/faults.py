@@ -245,7 +245,7 @@ FAULTS = (
     Fault("camera-half-pixel", "geometry/camera", "[0, sy, top_px + (sy - 1) / 2]", "[0, sy, top_px]"),
     Fault("camera-rays-transposed", "geometry/camera", "np.linalg.inv(self.K).T @ self.R",
           "np.linalg.inv(self.K).T @ self.R.T"),
-    Fault("sides-frame-before", "capture/sides", "if same < 0 else", "if same > 0 else"),
+    Fault("sides-frame-before", "capture/sides", "if same < 0:", "if same > 0:"),
     Fault("sides-gain", "capture/sides", "GAIN_SHARE = 0.04", "GAIN_SHARE = 0.0"),
     Fault("sides-disagreement", "capture/sides", "cameras * AGREED_SHARE", "cameras * GROSS_SHARE"),
     Fault("sides-hidden", "capture/sides", "(sides[..., 2:] > 0).all(0)", "1"),

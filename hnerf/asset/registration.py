@@ -55,6 +55,8 @@ def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
     own = skin[crossing_faces(body_m, skin)]
     for rings in RINGS:
         crossing = skin[crossing_faces(moved_m, skin)]
+        if not len(crossing):
+            break
         trust[np.setdiff1d(_around(crossing, faces, rings), _around(own, faces, rings))] = 0
         moved_m = body_m + plate.solver(trust, SMOOTHING_M[-1])(matched_m - body_m)
     return Registration(_loosened(moved_m, faces, body.skin_faces, plate), trust, plate)

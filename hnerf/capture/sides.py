@@ -75,7 +75,8 @@ def _exchanges(projections: np.ndarray, sides: np.ndarray, heights_px: np.ndarra
             if sure[t] or not 0 <= other < len(sure) or not sure[other] or abs(times_s[t] - times_s[other]) > NEAR_S:
                 continue
             same = np.nansum(across_m[t] * across_m[other])
-            which[:, t], across_m[t] = (~which[:, t], -across_m[t]) if same < 0 else (which[:, t], across_m[t])
+            if same < 0:
+                which[:, t], across_m[t] = ~which[:, t], -across_m[t]
             sure[t] = same != 0
     which[:, ties] &= sure[ties]
     return which
