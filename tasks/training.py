@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("training", version="43", resumable=True, checkpoint=NAME)
+@stage("training", version="44", resumable=True, checkpoint=NAME)
 def train(
     out: Path,
     recording: Artifact,

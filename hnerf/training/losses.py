@@ -1,6 +1,6 @@
 """The losses (docs/method.md): H-NeRF's nine, and three more. Sums over rays are means over rays here, so that a
-batch's size does not change the balance; sums over a ray's samples stay sums. The weights in the presets are the
-paper's in this form.
+batch's size does not change the balance; sums over a ray's samples stay sums. The weights in `paper` are the paper's
+in this form, so `inc`, which is no sum over rays, weighs more than there, except in `print` (docs/method.md).
 """
 
 from dataclasses import dataclass
@@ -62,7 +62,9 @@ def blend(samples: RaySamples, target: Target, eta: float) -> Float[Tensor, ""]:
     return (target.weight * (target.person + eta * (1 - target.person)) * error).mean()
 
 
-def geometry(samples: RaySamples, threshold: float, steepness: float, roles: GeometryRoles) -> Float[Tensor, ""]:
+def geometry(
+    samples: RaySamples, threshold: float, steepness: float, gamma: float, roles: GeometryRoles
+) -> Float[Tensor, ""]:
     """Return geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density.
 
     roles: "print" takes the density as the label, because the paper's seg has the label first, and moves both; with
@@ -70,22 +72,21 @@ def geometry(samples: RaySamples, threshold: float, steepness: float, roles: Geo
     """
     if samples.density is None:
         return samples.d.new_zeros(())
-    opaque, occupied = torch.sigmoid(steepness * (samples.density - threshold)), samples.alpha_dot
-    predicted, label = (occupied, opaque) if roles == "print" else (opaque, occupied.detach())
-    return (samples.in_box * _cross_entropy(predicted.clamp(EPSILON, 1 - EPSILON), label)).sum(1).mean()
+    opaque, occupied = steepness * (samples.density - threshold), -gamma * samples.d_hat  # before the sigmoid
+    logit, label = (occupied, opaque.sigmoid()) if roles == "print" else (opaque, samples.alpha_dot.detach())
+    return (samples.in_box * _cross_entropy(logit, label)).sum(1).mean()
 
 
 def segmentation(distance: Float[Tensor, "R K"], target: Target, sharpness: float) -> Float[Tensor, ""]:
-    """Return seg or fit: BCE(M, sigmoid(-gamma min_i d_i)) of distances: d_hat for seg, the body's d for fit. It
-    is computed from the logit, so that a person's pixel attracts a body however far away."""
-    logit = -sharpness * distance.amin(1)
-    return (softplus(logit) - target.person * logit).mean()
+    """Return seg or fit: BCE(M, sigmoid(-gamma min_i d_i)) of distances: d_hat for seg, the body's d for fit."""
+    return _cross_entropy(-sharpness * distance.amin(1), target.person).mean()
 
 
-def _cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
-    """Return the BCE of probabilities inside (0, 1). NaN passes through (torch's own function raises), so that the step
-    can be skipped."""
-    return -(target * predicted.log() + (1 - target) * (1 - predicted).log())
+def _cross_entropy(logit: Tensor, label: Tensor) -> Tensor:
+    """Return BCE(label, sigmoid(logit)). It is computed from the logit, so that the worst prediction has the full
+    slope: dense fog thins out, and a person's pixel attracts a body however far away. NaN passes through, so that the
+    step can be skipped."""
+    return softplus(logit) - label * logit
 
 
 def eikonal(samples: RaySamples) -> Float[Tensor, ""]:

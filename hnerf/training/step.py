@@ -35,18 +35,20 @@ class Objective(nn.Module):
         """Return the weighted losses by name, whose sum is minimised, and the colour errors of the rays (R,)."""
         target, draws = make_target(rays, draws, self.field.models_background)
         samples, depths_m = self.field.sample(dataclasses.replace(scene, correction=self.correction), rays, draws)
-        s = self.settings.losses
+        s, gamma = self.settings.losses, self.field.gamma
         errors = losses.colour_errors(samples, target)
         terms = {
             "reconstruction": lambda: errors.mean(),
             "mask": lambda: losses.mask(samples, target),
             "fog": lambda: losses.fog(samples, target),
             "blend": lambda: losses.blend(samples, target, s.eta),
-            "geometry": lambda: losses.geometry(samples, s.density_threshold, s.density_steepness, s.geometry_roles),
-            "segmentation": lambda: losses.segmentation(samples.d_hat, target, self.field.gamma),
+            "geometry": lambda: losses.geometry(
+                samples, s.density_threshold, s.density_steepness, gamma, s.geometry_roles
+            ),
+            "segmentation": lambda: losses.segmentation(samples.d_hat, target, gamma),
             "eikonal": lambda: losses.eikonal(samples),
             "residual": lambda: losses.residual(samples),
-            "fit": lambda: losses.segmentation(samples.d, target, self.field.gamma),
+            "fit": lambda: losses.segmentation(samples.d, target, gamma),
             "increment": lambda: losses.increment(self.correction),
             "elastic": lambda: losses.elastic(samples),
         }

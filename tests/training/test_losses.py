@@ -73,7 +73,8 @@ def test_blend():
 
 
 LABELS = 1 / (1 + math.exp(-1)), 0.5, 1 / (1 + math.exp(5))  # sigmoid(0.1 (sigma - 50)) of 60, 50 and 0
-COUPLED = replace(SAMPLES, alpha_dot=torch.tensor([[0.2, 0.9], [0.1, 0.5]]))
+OCCUPIED = torch.tensor([[0.2, 0.9], [0.1, 0.5]])
+COUPLED = replace(SAMPLES, alpha_dot=OCCUPIED, d=-OCCUPIED.logit() / 80, residual=torch.zeros(2, 2))
 
 
 def cross_entropies(predicted: tuple[float, ...], labels: tuple[float, ...]) -> float:
@@ -85,27 +86,34 @@ def cross_entropies(predicted: tuple[float, ...], labels: tuple[float, ...]) -> 
 def test_geometry_with_the_roles_in_the_published_formula():
     """Densities are labels for the predictions 0.2, 0.9 and 0.1; samples outside the box are ignored."""
     expected = cross_entropies((0.2, 0.9, 0.1), LABELS)
-    assert losses.geometry(COUPLED, 50.0, 0.1, "print").item() == pytest.approx(expected, rel=1e-5)
+    assert losses.geometry(COUPLED, 50.0, 0.1, 80.0, "print").item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_geometry_with_the_surface_as_labels():
     """Densities are predictions for the labels 0.2, 0.9 and 0.1, which get no gradient."""
     occupied, density = COUPLED.alpha_dot.clone().requires_grad_(), COUPLED.density.clone().requires_grad_()
-    loss = losses.geometry(replace(COUPLED, alpha_dot=occupied, density=density), 50.0, 0.1, "surface_leads")
+    loss = losses.geometry(replace(COUPLED, alpha_dot=occupied, density=density), 50.0, 0.1, 80.0, "surface_leads")
     assert loss.item() == pytest.approx(cross_entropies(LABELS, (0.2, 0.9, 0.1)), rel=1e-5)
     loss.backward()
     assert occupied.grad is None and density.grad is not None
     assert density.grad[0].tolist() == pytest.approx([0.1 * (LABELS[0] - 0.2) / 2, 0.1 * (0.5 - 0.9) / 2], rel=1e-4)
 
 
-def test_geometry_of_certain_predictions_is_finite():
-    """Predictions of 0, 1 and 0 are clamped by 1e-6: the labels 0.731, 0.5 and 0.0067 each cost 13.8 times as much."""
-    certain = sum(LABELS) * 6 * math.log(10) / 2
-    assert losses.geometry(SAMPLES, 50.0, 0.1, "print").item() == pytest.approx(certain, rel=2e-3)
+@pytest.mark.parametrize("roles", ["print", "surface_leads"])
+def test_the_worst_violations_of_geometry_have_the_full_slope(roles: str):
+    """Fog of 5000 in free space, 30 units from the surface: BCE(sigmoid(495), 0) = 495 with a slope of 0.1, and
+    BCE(sigmoid(-2400), 1) = 2400 with a slope of -80. Each ray has two such samples."""
+    density, d = torch.full((2, 2), 5000.0, requires_grad=True), torch.full((2, 2), 30.0, requires_grad=True)
+    nowhere, inside = torch.zeros(2, 2), torch.ones(2, 2)
+    samples = replace(SAMPLES, alpha_dot=nowhere, in_box=inside, residual=nowhere, density=density, d=d)
+    loss = losses.geometry(samples, 50.0, 0.1, 80.0, roles)
+    loss.backward()
+    led, slope, cost = (d, 80.0, 2400.0) if roles == "print" else (density, 0.1, 495.0)
+    assert loss.item() == pytest.approx(2 * cost) and led.grad.unique().item() == pytest.approx(slope / 2)
 
 
 def test_geometry_is_zero_if_the_sdf_is_the_density():
-    assert losses.geometry(replace(SAMPLES, density=None), 50.0, 0.1, "print").item() == 0
+    assert losses.geometry(replace(SAMPLES, density=None), 50.0, 0.1, 80.0, "print").item() == 0
 
 
 def test_cross_entropy_of_nan_is_nan():
@@ -184,7 +192,7 @@ def test_gradients_of_coupled_losses_in_double_precision():
         samples = replace(DOUBLE, alpha_dot=alpha_dot, density=density, residual=residual)
         return (
             losses.blend(samples, DOUBLE_TARGET, 0.25)
-            + losses.geometry(samples, 50.0, 0.1, "print")
+            + losses.geometry(samples, 50.0, 0.1, 80.0, "print")
             + losses.segmentation(samples.d_hat, DOUBLE_TARGET, 80.0)
         )
 
@@ -194,7 +202,7 @@ def test_gradients_of_coupled_losses_in_double_precision():
 
 def test_the_gradient_of_geometry_with_the_surface_as_labels_in_double_precision():
     def follow(density):
-        return losses.geometry(replace(DOUBLE, density=density), 50.0, 0.1, "surface_leads")
+        return losses.geometry(replace(DOUBLE, density=density), 50.0, 0.1, 80.0, "surface_leads")
 
     assert torch.autograd.gradcheck(follow, DOUBLE.density.clone().requires_grad_())
 
