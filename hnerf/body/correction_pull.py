@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hnerf.warp_import import wp
+from hnerf.warp_import import refuse_second_derivatives, wp
 
 
 class Displacement(torch.autograd.Function):
@@ -32,6 +32,7 @@ class Displacement(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        refuse_second_derivatives()
         found = tuple(gradient.new_zeros(shape) for shape in ctx.shapes)
         _launch(1, found, ctx.saved_tensors, gradient.contiguous())
         return *found, None, None, None, None, None, None

@@ -147,10 +147,11 @@ class PaperField(Field):
         return (samples.in_box * samples.alpha_dot).amax(1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
-        """Return d_hat (N,) in metres at points (N, 3) around the first body."""
+        """Return d_hat (N,) in metres at points (N, 3), cut by the box of the first body: DH is not trained outside."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described = bodies.describe(points_m, row, FAR_M, exact_sign=True)
-        return described.d + self.settings.scene_m * self._residual(points_m, described, row, conditions)
+        d_hat_m = described.d + self.settings.scene_m * self._residual(points_m, described, row, conditions)
+        return torch.maximum(d_hat_m, self.region(bodies, conditions).signed_distance(points_m))
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """Return c (N, 3) at points around the first body, seen along directions (N, 3)."""

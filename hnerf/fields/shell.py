@@ -192,11 +192,11 @@ class Boxes:
 
 def box_interval(rays: Rays, lower_m: Tensor, upper_m: Tensor) -> tuple[Tensor, Tensor]:
     """Return entry and exit depths (R,) of rays in axis-aligned boxes (R, 3) by the slab method; equal where the box is
-    missed."""
+    missed, at the first exit from a slab, since a ray parallel to another enters that one at infinity."""
     inverse = 1 / torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
     a, b = (lower_m - rays.origins_m) * inverse, (upper_m - rays.origins_m) * inverse
-    near = torch.minimum(a, b).amax(-1).clamp(min=0)
-    return near, torch.maximum(torch.maximum(a, b).amin(-1), near)
+    far = torch.maximum(a, b).amin(-1).clamp(min=0)
+    return torch.minimum(torch.minimum(a, b).amax(-1).clamp(min=0), far), far
 
 
 def stratified(near: Tensor, far: Tensor, jitter: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from hnerf.warp_import import wp
+from hnerf.warp_import import refuse_second_derivatives, wp
 
 
 class SparseGrids(nn.Module):
@@ -84,6 +84,7 @@ class _Interpolation(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, None, None]:
+        refuse_second_derivatives()
         unit, features, sizes, _ = ctx.saved_tensors
         of_features = torch.zeros_like(features)
         of_unit = torch.empty_like(unit) if ctx.needs_input_grad[0] else None

@@ -1,3 +1,4 @@
+import pytest
 import torch
 from torch import Tensor
 
@@ -42,3 +43,6 @@ def test_displacements_and_their_gradients_match_plain_torch() -> None:
         found.append([moved.detach(), *(values.grad for values in inputs)])
     for mine, plain in zip(*found, strict=True):
         torch.testing.assert_close(mine, plain, atol=1e-12, rtol=1e-12)
+    inputs = [values.requires_grad_() for values in learned]
+    with pytest.raises(RuntimeError, match="no second derivatives"):
+        torch.autograd.grad(Displacement.apply(*inputs, *bodies).sum(), inputs, create_graph=True)

@@ -293,7 +293,9 @@ def test_the_paper_preset_has_the_papers_values() -> None:
     weights += [losses.eikonal, losses.residual, losses.fit, losses.increment, losses.elastic]
     assert weights == [1, 1, 0.1, 0.02, 0.02, 1e-6, 5e-4, 1, 0.02, 0]
     assert LossSettings().eta == losses.eta == 1
-    assert load_settings("print").training.losses.increment == pytest.approx(0.02 / 4096, rel=0.01)  # not a sum over rays
+    assert load_settings("print").training.losses.increment == pytest.approx(
+        0.02 / 4096, rel=0.01
+    )  # not a sum over rays
 
 
 def test_point_queries_use_the_same_inputs_as_training() -> None:
@@ -307,6 +309,9 @@ def test_point_queries_use_the_same_inputs_as_training() -> None:
     expect_close(pose, rows([[-0.4, 0.5, 0.6]]))
     expect_close(root, rows([[1.0, 0, 0, -0.275, 0, 1, 0, 0.1, 0, 0, 1, -0.25]]))
     expect_close(seen, view)
+    beyond_m = torch.tensor([[1.95, 0.6, 0.05 + field.margin_m]])  # 5 cm outside B: as far from the surface as from B
+    field.residual.forward = lambda point, pose: torch.full_like(point[:, 0], -10.0)
+    expect_close(field.signed_distance(standing, beyond_m, conditions), torch.tensor([0.05]))
     static = field_of(static=True)
     expect_close(static.signed_distance(standing, point_m, conditions), torch.tensor([0.05 + 2 * 0.1 * -0.025]))
     expect_close(static.colour(standing, point_m, view, conditions), rows([[-0.025, 0.2, 0.275]]))

@@ -34,13 +34,15 @@ def along_x(grid: ShellGrid, x_m: list[float]) -> list[int]:
 
 
 def test_box_interval_by_hand():
-    """A ray along x is in [1, 2] from depth 1 to 2; for a ray that misses, the interval is empty."""
-    origins = torch.tensor([[0.0, 0.5, 0.5], [0.0, 5.0, 0.5]])
-    rays = Rays(origins, torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), torch.zeros(2).long())
-    lower, upper = torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), torch.tensor([[2.0, 1.0, 1.0]]).expand(2, 3)
+    """A ray along x is in [1, 2] from depth 1 to 2. For those that miss, 4 m beside in y, the interval is empty: at the
+    origin, or at depth 2, where the ray leaves the slab in x. It enters the one in y at 4e9 m, which no network should
+    see."""
+    origins = torch.tensor([[0.0, 0.5, 0.5], [0.0, 5.0, 0.5], [0.0, -4.0, 0.5]])
+    rays = Rays(origins, torch.tensor([[1.0, 0.0, 0.0]]).expand(3, 3), torch.zeros(3).long())
+    lower, upper = torch.tensor([[1.0, 0.0, 0.0]]).expand(3, 3), torch.tensor([[2.0, 1.0, 1.0]]).expand(3, 3)
     near, far = box_interval(rays, lower, upper)
     assert (near[0].item(), far[0].item()) == (1.0, 2.0)
-    assert near[1] == far[1]
+    assert near[1:].tolist() == far[1:].tolist() == [0.0, 2.0]
 
 
 def test_box_interval_of_a_ray_that_starts_inside():

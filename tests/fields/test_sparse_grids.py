@@ -1,5 +1,6 @@
 """Features of the nodes that are kept: interpolation and gradients with warp match the plain grids."""
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -56,6 +57,12 @@ def test_a_flat_box_is_one_cell_thick() -> None:
     """Of 8 cells along 2 m, 4 fit along 1 m, and less than half a cell along 0.1 m. A single cell has two nodes."""
     grids = SparseGrids(LOWER_M, torch.tensor([1.0, 2.0, 0.1]), (8,), CHANNELS, everywhere)
     assert grids.sizes.tolist() == [[5, 9, 2]]
+
+
+def test_second_derivatives_are_refused() -> None:
+    points = POINTS.clone().requires_grad_()
+    with pytest.raises(RuntimeError, match="no second derivatives"):
+        torch.autograd.grad(both()[0](points).sum(), points, create_graph=True)
 
 
 def test_an_empty_batch_of_points_gives_empty_features() -> None:
