@@ -461,7 +461,7 @@ FAULTS = (
     Fault("regions-limit", "asset/regions", "1e3 * surface.closest", "surface.closest"),
     Fault("colours-off-surface", "asset/field_colours", "<= OFF_SURFACE_M", "<= 1.0"),
     Fault("colours-median", "asset/field_colours", "for k in (seen - 1, seen)", "for k in (seen, seen)"),
-    Fault("avatar-other-frame", "avatar/trained", "same[apart.argmin(keepdim=True)]", "same[:1]"),
+    Fault("avatar-other-frame", "avatar/avatar", "same[apart.argmin(keepdim=True)]", "same[:1]", "avatar/trained"),
     Fault("lpips-filling", "evaluation/lpips", "value=-1.0)", "value=0.0)"),
     Fault("surface-step", "avatar/surface", "vertices_m - step_to_surface(", "vertices_m + step_to_surface(",
           "asset/correctives"),

@@ -7,7 +7,8 @@ from pathlib import Path
 import cv2
 from safetensors import SafetensorError
 
-from hnerf.avatar.trained import TrainedAvatar, load_avatar, stored_settings
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.trained import load_avatar, stored_settings
 from hnerf.calibration.calibrated import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
@@ -45,7 +46,7 @@ def recording_of(subject: Path) -> Capture:
         return load_cameras(subject / "calibration", capture)
 
 
-def avatar_of(subject: Path) -> TrainedAvatar:
+def avatar_of(subject: Path) -> Avatar:
     """Load a subject's trained avatar, onto the GPU if there is one."""
     with readable(subject / "training"):
         return load_avatar(subject / "training")

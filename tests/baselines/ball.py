@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import torch
 
-from hnerf.avatar.trained import TrainedAvatar, load_avatar
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks, encode
@@ -55,7 +56,7 @@ def record(folder: Path) -> tuple[Capture, Masks, BodyFit]:
     return capture, Masks(masks, {}), body()
 
 
-def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) -> TrainedAvatar:
+def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) -> Avatar:
     """Train on the ball with the given cameras of the ring."""
     capture, masks, fit = record(folder / "capture")
     capture = dataclasses.replace(capture, train_cameras=cameras)
@@ -64,7 +65,7 @@ def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) 
     return load_avatar(folder / "out", "cpu")
 
 
-def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:
+def psnr(avatar: Avatar, folder: Path, name: str) -> float:
     """Return the PSNR of a ring camera's whole image, rendered over black."""
     camera = record(folder / "capture")[0].cameras[name]
     drawn = avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
@@ -72,7 +73,7 @@ def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:
     return float(-10 * torch.log10(((drawn.rgb - wanted) ** 2).mean()))
 
 
-def inner_psnr(avatar: TrainedAvatar, folder: Path, name: str) -> tuple[float, float]:
+def inner_psnr(avatar: Avatar, folder: Path, name: str) -> tuple[float, float]:
     """Return the PSNR of the ball's colours at least two pixels inside its outline, and the PSNR of their mean colour
     there."""
     camera = record(folder / "capture")[0].cameras[name]
@@ -84,7 +85,7 @@ def inner_psnr(avatar: TrainedAvatar, folder: Path, name: str) -> tuple[float, f
     return tuple((-10 * errors.log10()).tolist())
 
 
-def radii_m(avatar: TrainedAvatar, directions: torch.Tensor) -> torch.Tensor:
+def radii_m(avatar: Avatar, directions: torch.Tensor) -> torch.Tensor:
     """Return the distance (N,) of the outermost surface from the ball's centre along directions (N, 3)."""
     steps_m = torch.linspace(0, 1, 201)
     points = torch.from_numpy(MIDDLE_M).float() + directions[:, None] * steps_m[:, None]

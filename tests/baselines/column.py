@@ -7,7 +7,8 @@ from pathlib import Path
 
 import torch
 
-from hnerf.avatar.trained import TrainedAvatar, load_avatar
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
@@ -22,7 +23,7 @@ class Learned:
 
     capture: Capture
     body: BodyFit
-    avatar: TrainedAvatar
+    avatar: Avatar
 
     @cache  # noqa: B019 there are few instances, which live as long as their tests
     def psnr(self, frame: int) -> float:
