@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from hnerf.body.common_rest import with_common_rest
 from hnerf.body.rig import pose_vertices, rotation_from_axis_angle
+from hnerf.training.tuned_poses import with_common_rest
 from tests.body.boxes import box_rig
 
 RIG = box_rig(bend_segments=6)
