@@ -313,7 +313,7 @@ FAULTS = (
     Fault("fingers-bent-at-rest", "body/fingers", "deg2rad(relaxed) - bend", "deg2rad(relaxed) + bend"),
     Fault("fingers-across-gaps", "body/fingers", "np.arange(ends[-1]), ends - 1)",
           "np.arange(ends[-1]), ends[-1:] - 1)"),
-    Fault("hands-seen-once", "body/hand_points", "seen_twice(hands[..., 2].amax(-1))[..., None]", "1"),
+    Fault("hands-seen-once", "body/hand_points", "hands[..., 2] * seen_twice[..., None]", "hands[..., 2]"),
     Fault("hands-by-wrist", "body/fingers", "confidence.unflatten(-1, (2, -1)).amax(-1)", "confidence[..., [0, 21]]"),
     Fault("hands-of-anybody", "detection/hands", "if exchanged else given[i, person]", "if exchanged else given[i, 0]"),
     Fault("hands-given-ignored", "detection/hands", "for name in people if name not in own}", "for name in people}"),

@@ -116,13 +116,10 @@ class PosedBodies:
         self._linear = posed[..., :3].contiguous()
         self._inverse = torch.linalg.inv(self._linear).contiguous()
         self.vertices_m = (self._linear @ rig.vertices_m[..., None])[..., 0] + posed[..., 3]
-        self._joint_shape = self._joint_shape_motion()
-
-    def _joint_shape_motion(self) -> Tensor:
-        """Return how a unit of each shape value moves the points that each joint carries rigidly, (n J, 3 B) metres:
-        the joint's displacement in the world minus its rotated displacement in the rest body."""
-        turned = self._joints[..., :3, :3] @ self.rig.joint_basis.permute(1, 2, 0)
-        return (posed_joint_basis(self.rig, self._joints, self.root) - turned).flatten(2).flatten(0, 1)
+        # How a unit of each shape value moves the points that each joint carries rigidly, (n, J, 3, B) metres: the
+        # joint's displacement in the world minus its rotated displacement in the rest body.
+        turned = self._joints[..., :3, :3] @ rig.joint_basis.permute(1, 2, 0)
+        self._joint_shape = posed_joint_basis(rig, self._joints, self.root) - turned
 
     def correction(self) -> PoseCorrection:
         """Return a correction of zero for these frames."""
@@ -240,7 +237,7 @@ class PosedBodies:
         shift = -torch.linalg.cross(correction.turn, pivots)
         shift = torch.cat([shift[:, :-1], shift[:, -1:] + correction.move_m[:, None]], 1)  # the root carries everything
         bulge = torch.einsum("b,bvd->vd", correction.shape, self.rig.shape_basis)
-        carried = (self._joint_shape.unflatten(1, (3, -1)) @ correction.shape).unflatten(0, (len(shift), -1))
+        carried = self._joint_shape @ correction.shape
         posed = (frame * len(bulge) + nearest).int()
         bodies = (self._subtree_weights, self._linear.flatten(0, 1), self._skin_joints, self.rig.skin_weights)
         return Displacement.apply(torch.stack([correction.turn, shift], 2), bulge, carried, points_m, posed, *bodies)

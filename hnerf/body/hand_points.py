@@ -59,22 +59,18 @@ def hand_points(articulation: Articulation) -> Points:
 
 
 def observe_hands(capture: Capture) -> Views | None:
-    """Return the hand points (C, n, 42) of the training cameras; None if hands were not looked for. None also with a
-    single camera: its hand points pull the body to another depth (limb joints of valid-walk are 62 mm off, 59
-    without)."""
+    """Return the hand points (C, n, 42) of the training cameras, without hands that fewer than two of them see; None if
+    hands were not looked for. None also with a single camera: its hand points pull the body to another depth (limb
+    joints of valid-walk are 62 mm off, 59 without)."""
     found = [capture.hands(name) for name in capture.train_cameras]
     if len(found) < 2 or not all(hands is not None for hands in found):
         return None
     hands = torch.from_numpy(np.stack([h for h in found if h is not None]).astype(np.float64))  # (C, n, 2, 21, 3)
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
-    confidence = hands[..., 2] * seen_twice(hands[..., 2].amax(-1))[..., None]
+    # A single view hardly distinguishes a palm that leans towards the camera from one that leans away.
+    seen_twice = (hands[..., 2].amax(-1) > SEEN).sum(0) > 1
+    confidence = hands[..., 2] * seen_twice[..., None]
     return Views(cameras, hands[..., :2].flatten(2, 3), confidence.flatten(2, 3))
-
-
-def seen_twice(confidence: Tensor) -> Tensor:
-    """Return which hands (n, 2) at least two cameras see, from the confidences of their surest points (C, n, 2). A
-    single view hardly distinguishes a palm that leans towards the camera from one that leans away."""
-    return (confidence > SEEN).sum(0) > 1
 
 
 @dataclass(frozen=True)

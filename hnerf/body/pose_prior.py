@@ -51,7 +51,7 @@ class PosePrior:
         self.axes = torch.stack([_axes(*pair, name in HINGES) for pair, name in zip(pairs, names, strict=True)])
         std = torch.tensor([STD_DEG.get(name, OTHER_STD_DEG) for name in names], dtype=bones.dtype)
         self.sigma = torch.deg2rad(std)
-        bend = torch.stack([_angle(*pair) for pair in pairs])
+        bend = torch.stack([torch.arccos((above @ own).clamp(-1, 1)) for above, own in pairs])
         hinge = torch.tensor([name in HINGES for name in names])
         span = torch.deg2rad(torch.tensor([FLEXION_DEG.get(name, (-180, 180)) for name in names], dtype=bones.dtype))
         low = torch.where(hinge, -bend, span[:, 0])
@@ -116,11 +116,6 @@ def turn_axes(flexion: Tensor, bone: Tensor) -> Tensor:
     flexion = flexion - (flexion @ bone) * bone
     flexion = flexion / flexion.norm()
     return torch.stack([flexion, bone, torch.linalg.cross(flexion, bone)])
-
-
-def _angle(a: Tensor, b: Tensor) -> Tensor:
-    """Return the angle between two unit vectors in radians."""
-    return torch.arccos((a @ b).clamp(-1, 1))
 
 
 class Smoothness:

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import Rig
 from hnerf.geometry.camera import Camera
 from hnerf.render.motion import Motion, select_poses
 from hnerf.render.shape import transfer_poses, with_shape_values
@@ -38,12 +37,7 @@ class LivePerson:
     def __init__(self, avatar: Avatar, motions: Mapping[str, Motion]) -> None:
         self._avatar, self.motions = avatar, motions
         rig = next(iter(motions.values())).body.rig
-
-        @lru_cache(KEPT_SHAPES)
-        def reshaped(changes: tuple[tuple[str, float], ...]) -> Rig:
-            return with_shape_values(rig, dict(changes))
-
-        self._reshaped = reshaped
+        self._reshaped = lru_cache(KEPT_SHAPES)(lambda changes: with_shape_values(rig, dict(changes)))
 
     def picture(self, camera: Camera, shown: Shown) -> np.ndarray:
         """Render the person over black, (H, W, 3) uint8. Raises InputError if the shape is impossible."""

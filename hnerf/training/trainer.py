@@ -108,12 +108,8 @@ class Trainer:
     @property
     def steps(self) -> int:
         """Return the number of steps of both phases."""
-        return self.field_steps + (self.settings.novel_pose_steps if self._novel_frames_learn else 0)
-
-    @property
-    def _novel_frames_learn(self) -> bool:
         learns = self.settings.pose_learning_rate > 0 or len(self.field.frame_parameters()) > 0
-        return learns and len(self.novel_rows) > 0
+        return self.field_steps + (self.settings.novel_pose_steps if learns and len(self.novel_rows) else 0)
 
     def _set_poses(self, bodies: PosedBodies) -> None:
         """Use the bodies' current poses for the coming steps."""

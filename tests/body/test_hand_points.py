@@ -7,7 +7,7 @@ import torch
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.hand_points import PalmTerm, hand_points, has_fingers, moved_onto_palm, observe_hands, seen_twice
+from hnerf.body.hand_points import PalmTerm, hand_points, has_fingers, moved_onto_palm, observe_hands
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.reprojection import Views, project
 from tests.body.recorded_body import ring_camera
@@ -61,12 +61,6 @@ def test_the_points_of_a_palm_count_as_one_observation() -> None:
     equations = NormalEquations(2, articulation.unknowns, len(pose.rig.beta))
     cost = PalmTerm(views).add(equations, articulation, joints, torch.full((2, 2), 0.001))
     np.testing.assert_allclose(cost, 2 * 12 / 1.24)
-
-
-def test_a_hand_must_be_seen_by_two_cameras() -> None:
-    """Of three cameras, two see the left hand and one the right; in the next frame, three and two do."""
-    confidence = torch.tensor([[[0.9, 0.9], [0.9, 0.6]], [[0.6, 0.4], [0.7, 0.8]], [[0.1, 0.0], [0.6, 0.5]]])
-    assert seen_twice(confidence).tolist() == [[True, False], [True, True]]
 
 
 def test_observations_of_hands_seen_by_one_camera_are_dropped() -> None:
