@@ -12,17 +12,7 @@ from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.config import FastFieldSettings
 from hnerf.fields.base import Field, composited
 from hnerf.fields.conditions import Conditions, Draws
-from hnerf.fields.fast import (
-    MOST_RENDERED,
-    SATURATED_LOGIT,
-    SHELL_MARGIN_M,
-    TIGHTEN_STEP_M,
-    FastField,
-    least_around,
-    least_of_limbs,
-    move_to_surface,
-    shown,
-)
+from hnerf.fields.fast import MOST_RENDERED, FastField, least_around, least_of_limbs, move_to_surface, shown
 from hnerf.fields.rays import PosedScene, Rays
 from hnerf.geometry.camera import Camera
 from hnerf.training.losses import pixel_colour
@@ -58,21 +48,6 @@ def from_above(*origins_m: tuple[float, float, float]) -> Rays:
     """Return rays along -z in the frame of the first body."""
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(len(origins_m), 3)
     return Rays(torch.tensor(origins_m), down, torch.zeros(len(origins_m), dtype=torch.long))
-
-
-def test_the_shell_is_tightened_to_where_the_opacity_changes():
-    """In an untrained field, d_hat is d. A logistic of 1000 per metre saturates 5 mm from the skin, one of 10 per metre
-    nowhere."""
-    _, conditions = standing()
-    sharp, soft = field_of(1000.0), field_of(10.0)
-    for field in (sharp, soft):
-        field.tighten(RIG, conditions.pose)
-    seen_m = SATURATED_LOGIT / 1000
-    for thickness in (sharp.outer_m, sharp.inner_m):
-        assert (thickness <= seen_m + SHELL_MARGIN_M + 1e-6).all()
-        assert thickness.max().item() == pytest.approx(seen_m + SHELL_MARGIN_M, abs=TIGHTEN_STEP_M)
-    assert soft.outer_m.max().item() == pytest.approx(SETTINGS.outer_m)
-    assert soft.inner_m.max().item() == pytest.approx(SETTINGS.inner_m)
 
 
 def test_a_tightened_shell_renders_the_same_image():

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import LossSettings, PaperFieldSettings, load_settings
 from hnerf.fields.conditions import Conditions, Draws
-from hnerf.fields.paper import PaperField
+from hnerf.fields.paper import PaperField, sample_pdf
 from hnerf.fields.rays import Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.training.pixels import PixelRays
@@ -315,3 +315,11 @@ def test_point_queries_use_the_same_inputs_as_training() -> None:
     static = field_of(static=True)
     expect_close(static.signed_distance(standing, point_m, conditions), torch.tensor([0.05 + 2 * 0.1 * -0.025]))
     expect_close(static.colour(standing, point_m, view, conditions), rows([[-0.025, 0.2, 0.275]]))
+
+
+def test_fine_samples_by_hand() -> None:
+    """All weight is in [1, 2], the second of four unit cells: the four samples are 1.125, 1.375, 1.625 and 1.875."""
+    middles = torch.tensor([[0.5, 1.5, 2.5, 3.5]])
+    weights = torch.tensor([[0.0, 1000.0, 0.0, 0.0]])
+    depths = sample_pdf(middles, torch.zeros(1), torch.full((1,), 4.0), weights, torch.full((1, 4), 0.5))
+    torch.testing.assert_close(depths, torch.tensor([[1.125, 1.375, 1.625, 1.875]]), atol=1e-3, rtol=0)

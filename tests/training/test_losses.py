@@ -137,12 +137,6 @@ def test_a_distant_body_is_pulled_with_full_slope():
     assert far.grad.flatten().tolist() == pytest.approx([40.0, 40.0])
 
 
-def test_fit_uses_the_distance_to_the_body_only():
-    """min d = 0.01 on the person, that is outside the body: -log sigmoid(-0.8)."""
-    expected = -math.log(1 / (1 + math.exp(0.8))) - math.log(1 - 1 / (1 + math.exp(8)))
-    assert losses.segmentation(SAMPLES.d, TARGET, 80.0).item() == pytest.approx(expected / 2, rel=1e-4)
-
-
 def test_eikonal():
     assert losses.eikonal(SAMPLES).item() == pytest.approx((0.25 + 0.04) / 2)
 
