@@ -31,26 +31,14 @@ class BoxField(Field):
     centre_m: Tensor
     scale_m: Tensor
 
-    def __init__(self, body: BodyFit, samples: int, learning_rate: float):
+    def __init__(self, body: BodyFit, settings: Any):
         super().__init__()
-        self.samples, self.learning_rate = samples, learning_rate
+        self.settings, self.samples = settings, settings.samples
         boxes = Boxes.around(body.vertices_m(), self.margin_m)
         lower_m, upper_m = boxes.lower_m.amin(0), boxes.upper_m.amax(0)
         self.register_buffer("canonical_m", body.rig.vertices_m.clone())
         self.register_buffer("centre_m", (lower_m + upper_m) / 2)
         self.register_buffer("scale_m", (upper_m - lower_m).max() / 2)
-
-    def box(self, bodies: PosedBodies) -> Boxes:
-        """Return the box of each body."""
-        return Boxes.around(bodies.vertices_m, self.margin_m)
-
-    def region(self, bodies: PosedBodies, conditions: Conditions) -> Any:
-        """Return the boxes."""
-        return self.box(bodies)
-
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """Return one parameter group with all parameters."""
-        return [{"params": list(self.parameters()), "lr": self.learning_rate}]
 
     def scaled(self, points_m: Tensor) -> Tensor:
         """Transform world points to box coordinates."""
@@ -73,7 +61,7 @@ class StaticField(BoxField):
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Return the signed distance (N,) in metres at points (N, 3), cut and closed by the box of the first body."""
-        return torch.maximum(self.distance(points_m), self.box(bodies).signed_distance(points_m))
+        return torch.maximum(self.distance(points_m), self.region(bodies, conditions).signed_distance(points_m))
 
     @abstractmethod
     def distance(self, points_m: Tensor) -> Tensor:
@@ -85,8 +73,8 @@ class DynamicField(BoxField):
     for frames that are not trained on; a pose that belongs to no frame (Conditions.frame_row = -1) takes the zero
     code."""
 
-    def __init__(self, body: BodyFit, samples: int, learning_rate: float, code_width: int):
-        super().__init__(body, samples, learning_rate)
+    def __init__(self, body: BodyFit, settings: Any, code_width: int):
+        super().__init__(body, settings)
         self.codes = nn.Parameter(torch.zeros(len(body.frames), code_width))
 
     def code(self, conditions: Conditions) -> Tensor:

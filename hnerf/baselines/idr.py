@@ -79,7 +79,7 @@ class IdrField(StaticField):
     gamma = 50.0  # per metre: sharpness of the mask loss
 
     def __init__(self, body: BodyFit, settings: IdrSettings):
-        super().__init__(body, settings.samples, settings.learning_rate)
+        super().__init__(body, settings)
         boxes = Boxes.around(body.vertices_m(), self.margin_m)
         radius = INITIAL_RADIUS * float((boxes.upper_m - boxes.lower_m).min() / 2 / self.scale_m)
         self.geometry = SdfNetwork(settings.width, radius)

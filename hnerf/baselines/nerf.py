@@ -56,7 +56,7 @@ class NerfField(StaticField):
     """
 
     def __init__(self, body: BodyFit, settings: NerfSettings):
-        super().__init__(body, settings.samples, settings.learning_rate)
+        super().__init__(body, settings)
         self.coarse, self.fine = NerfNetwork(settings.width), NerfNetwork(settings.width)
 
     def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:

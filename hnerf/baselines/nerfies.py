@@ -65,8 +65,7 @@ class NerfiesField(DynamicField):
     progress: Tensor
 
     def __init__(self, body: BodyFit, settings: NerfiesSettings):
-        super().__init__(body, settings.samples, settings.learning_rate, settings.code_width)
-        self.settings = settings
+        super().__init__(body, settings, settings.code_width)
         self.deformation = Deformation(settings.code_width, settings.deformation_width)
         self.template = NerfNetwork(settings.width)
         self.register_buffer("progress", torch.zeros(()))
@@ -109,7 +108,7 @@ class NerfiesField(DynamicField):
         """Return the pseudo-distance (N,) to the surface of density sigma_h (as NerfField) at the first body's instant,
         cut and closed by its box."""
         density = self._evaluate(points_m, torch.zeros_like(points_m), conditions)[0]
-        return torch.maximum(self.pseudo_distance(density), self.box(bodies).signed_distance(points_m))
+        return torch.maximum(self.pseudo_distance(density), self.region(bodies, conditions).signed_distance(points_m))
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """Return c (N, 3) at points (N, 3) at the first body's instant, seen along directions (N, 3)."""

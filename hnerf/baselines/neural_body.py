@@ -90,8 +90,7 @@ class NeuralBodyField(DynamicField):
     """
 
     def __init__(self, body: BodyFit, settings: NeuralBodySettings):
-        super().__init__(body, settings.samples, settings.learning_rate, APPEARANCE_WIDTH)
-        self.settings = settings
+        super().__init__(body, settings, APPEARANCE_WIDTH)
         width, features = settings.width, settings.channels * (LEVELS - 1)
         self.vertex_codes = nn.Parameter(INITIAL_CODE_STD * torch.randn(len(body.rig.vertices_m), settings.code_width))
         self.diffusion = Diffusion(settings.code_width, settings.channels)
@@ -108,7 +107,7 @@ class NeuralBodyField(DynamicField):
         local_m = _to_root_frame(bodies.vertices_m, bodies.root)
         voxels = [Voxels.around(points_m, self.settings.voxel_m, LEVELS) for points_m in local_m]
         diffused = None if self.training else [self.diffusion(self.vertex_codes, v) for v in voxels]
-        return NeuralBodyRegion(self.box(bodies), bodies.root, voxels, diffused)
+        return NeuralBodyRegion(super().region(bodies, conditions), bodies.root, voxels, diffused)
 
     def sample(self, scene: PosedScene[NeuralBodyRegion], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, at `samples` depths in the body's box."""

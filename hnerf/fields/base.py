@@ -14,6 +14,7 @@ from hnerf.fields.compositing import composite, weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
+from hnerf.fields.shell import Boxes
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import within_box
 
@@ -21,17 +22,18 @@ from hnerf.geometry.reach import within_box
 class Field(nn.Module, ABC):
     """Base class of H-NeRF's two fields and the compared methods.
 
-    canonical_m (V, 3): the rig's canonical vertices, saved with the field. samples: random numbers needed per ray.
-    unit_m: unit of the distances that `sample` returns. gamma: sharpness of the silhouette, per such unit. margin_m:
-    how far around the body's extent anything can be visible. models_background: whether the field models the
-    photograph's background; otherwise it is composited over the clean plate. whole_images: whether training draws from
-    all pixels, or only from `visible_pixels` and the mask's. common_rest: whether the rest body absorbs changes that
-    training makes to all poses alike.
+    settings: its own section. canonical_m (V, 3): the rig's canonical vertices, saved with the field. samples: random
+    numbers needed per ray. unit_m: unit of the distances that `sample` returns. gamma: sharpness of the silhouette, per
+    such unit. margin_m: how far around the body's extent anything can be visible. models_background: whether the field
+    models the photograph's background; otherwise it is composited over the clean plate. whole_images: whether training
+    draws from all pixels, or only from `visible_pixels` and the mask's. common_rest: whether the rest body absorbs
+    changes that training makes to all poses alike.
     """
 
     models_background: ClassVar[bool] = False
     common_rest: ClassVar[bool] = False
     whole_images: bool = False
+    settings: Any
     canonical_m: Tensor
     samples: int
     unit_m: float = 1.0
@@ -43,9 +45,9 @@ class Field(nn.Module, ABC):
         """Return an untrained field around a fitted body; static: the capture has one training frame."""
         return cls(body, settings)  # type: ignore[call-arg]  # how most fields are constructed
 
-    @abstractmethod
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Any:
-        """Return where rays are sampled, by body row."""
+        """Return where rays are sampled, by body row: by default in the extent of each body, and a margin."""
+        return Boxes.around(bodies.vertices_m, self.margin_m)
 
     def scene(self, bodies: PosedBodies, conditions: Conditions) -> PosedScene[Any]:
         """Return the scene in which rays around these bodies are evaluated."""
@@ -61,9 +63,9 @@ class Field(nn.Module, ABC):
         """Return the pixels (H, W) bool that can show any part of a body with vertices (V, 3)."""
         return within_box(camera, vertices_m, self.margin_m)
 
-    @abstractmethod
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Return parameter groups for Adam."""
+        """Return parameter groups for Adam: by default a single one."""
+        return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
     def compile_networks(self) -> None:
         """Have torch fuse the operations of networks that spend their time moving activations, for training on a

@@ -43,6 +43,7 @@ class FastField(Field):
     """Networks, sharpness, the canonical body, and its deformation in every frame; it holds no poses."""
 
     common_rest = True
+    settings: FastFieldSettings
     outer_m: Tensor
     inner_m: Tensor
     corners: Tensor

@@ -29,6 +29,7 @@ class PaperField(Field):
     """F and DH. Dynamic: conditioned on (s, d) and theta. Static (one frame): on x itself, unconditioned."""
 
     models_background = True
+    settings: PaperFieldSettings
     centre_m: Tensor
 
     @classmethod
@@ -48,14 +49,6 @@ class PaperField(Field):
         point, pose, self.root_inputs = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), root_inputs)
         self.radiance = RadianceMLP(point, pose, self.root_inputs, settings.view_octaves, settings.bf16)
         self.residual = ResidualMLP(point, pose, settings.bf16)
-
-    def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
-        """Return the box B of each pose: the body's extent and a margin."""
-        return Boxes.around(bodies.vertices_m, self.margin_m)
-
-    def parameter_groups(self) -> list[dict]:
-        """Return parameter groups for Adam."""
-        return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
     def compile_networks(self) -> None:
         """Compile F, but not DH: torch does not compile the second derivatives that `eikonal` needs. If compilation
