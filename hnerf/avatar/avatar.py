@@ -43,7 +43,6 @@ class Avatar:
 
     field: Field
     body: BodyFit
-    scene_m: float
     learned: BodyFit
     gains: Gains = dataclasses.field(default_factory=dict)
 
@@ -116,9 +115,8 @@ class Avatar:
         return torch.cat([self.field.colour(bodies, x, v, conditions) for x, v in parts])
 
     def _pose(self, theta: Tensor, root: Tensor) -> tuple[PosedBodies, Conditions]:
-        rig = self.body.rig
-        bodies = PosedBodies(rig, theta[None], root[None], self.field.canonical_m)
-        return bodies, Conditions.of(rig, theta[None], root[None], self._frame_row(theta, root), self.scene_m)
+        bodies = PosedBodies(self.body.rig, theta[None], root[None], self.field.canonical_m)
+        return bodies, Conditions.of(bodies, self._frame_row(theta, root), self.field.settings.scene_m)
 
     def _frame_row(self, theta: Tensor, root: Tensor) -> Tensor:
         """Return the learned row (1,) with the same joint angles theta: of several, the one with the closest root; -1

@@ -54,7 +54,7 @@ def load_avatar(folder: Path, device: torch.device | str | None = None) -> Avata
     before_tuning = dataclasses.replace(body, rig=dataclasses.replace(body.rig, vertices_m=tensors["canonical_m"]))
     field = build_field(settings.field, before_tuning, static).to(device)
     load_field(field, tensors, path)
-    return Avatar(field.eval(), body, settings.field.scene_m, body, gains)
+    return Avatar(field.eval(), body, body, gains)
 
 
 def stored_settings(folder: Path) -> tuple[config.TrainingSettings, bool, Gains]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 import torch
 from torch import Tensor
 
-from hnerf.body.rig import Rig
+from hnerf.body.canonical import PosedBodies
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -27,10 +27,10 @@ class Conditions:
     frame_row: Tensor
 
     @staticmethod
-    def of(rig: Rig, theta: Tensor, root: Tensor, frame_row: Tensor, scene_m: float) -> "Conditions":
-        """Build the conditions from theta (n, J, 3) and root (n, 4, 4); scene_m: metres per scene unit."""
-        scaled = torch.cat([root[:, :3, :3], root[:, :3, 3:] / scene_m], -1)
-        return Conditions(theta[:, rig.free].flatten(1), scaled.flatten(1), frame_row)
+    def of(bodies: PosedBodies, frame_row: Tensor, scene_m: float) -> "Conditions":
+        """Build the conditions of n bodies; scene_m: metres per scene unit."""
+        scaled = torch.cat([bodies.root[:, :3, :3], bodies.root[:, :3, 3:] / scene_m], -1)
+        return Conditions(bodies.theta[:, bodies.rig.free].flatten(1), scaled.flatten(1), frame_row)
 
     def with_noise(self, sigma: float, generator: torch.Generator) -> "Conditions":
         """Return the conditions with Gaussian noise on theta and T, so that networks do not memorise poses (paper,

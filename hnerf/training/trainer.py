@@ -114,7 +114,7 @@ class Trainer:
     def _set_poses(self, bodies: PosedBodies) -> None:
         """Use the bodies' current poses for the coming steps."""
         frame_rows = torch.arange(len(bodies.theta), device=bodies.theta.device)
-        conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.field.scene_m)
+        conditions = Conditions.of(bodies, frame_rows, self.settings.field.scene_m)
         self.scene = self.field.scene(bodies, conditions)
 
     def run(self) -> TrainingReport | None:

@@ -100,7 +100,7 @@ def test_of_frames_in_the_same_pose_the_one_nearest_in_position_is_used():
     theta, root = torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1)
     root[1, 0, 3] = 1.0
     body = BodyFit(box_rig(), (0, 1), theta, root)
-    avatar = Avatar(build_field(TINY.field, body, False), body, 2.5, body)
+    avatar = Avatar(build_field(TINY.field, body, False), body, body)
     between = root[0].clone()
     between[0, 3] = 0.4
     assert [avatar._frame_row(theta[0], place).item() for place in (*root, between)] == [0, 1, 0]

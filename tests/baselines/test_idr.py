@@ -129,7 +129,7 @@ def test_distances_of_rays_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     field = IdrField(fit, settings)
     field.geometry = Ball(settings.width)
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
-    conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
+    conditions = Conditions.of(bodies, torch.zeros(1, dtype=torch.long), 2.5)
     origins = torch.tensor([[-3.0, 0.6, 0.5], [-3.0, 0.85, 0.5], [-3.0, 0.5, 0.5]])
     rays = Rays(origins, torch.tensor([[1.0, 0, 0]] * 3), torch.zeros(3, dtype=torch.long))
     jitter = torch.tensor([[0.0, 0.9], [0.5, 0.0], [0.5, 0.0]])  # at 2.9 and 4.04 m; at 3.2 and 3.5 m

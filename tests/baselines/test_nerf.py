@@ -57,7 +57,7 @@ def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
     """Sample two rays over white: one through the middle of the box, 4 m of it inside, and one that misses it."""
     fit = body()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
-    conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
+    conditions = Conditions.of(bodies, torch.zeros(1, dtype=torch.long), 2.5)
     origins = torch.tensor([[-3.0, 0.5, 0.5], [-3.0, 5.0, 0.5]])
     rays = Rays(origins, torch.tensor([[1.0, 0, 0]]).repeat(2, 1), torch.zeros(2, dtype=torch.long))
     draws = dataclasses.replace(jitter, background=torch.ones(2, 3))
@@ -97,7 +97,7 @@ def test_the_surface_is_where_the_density_is_sigma_h(fog: NerfField) -> None:
     at twice sigma_h."""
     fit = body()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, fog.canonical_m)
-    conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
+    conditions = Conditions.of(bodies, torch.zeros(1, dtype=torch.long), 2.5)
     for density, distance in ((40.0, 0.0), (0.0, BAND_M), (80.0, -BAND_M / 3)):
         fog.fine = Fog(density, 0)
         found = fog.signed_distance(bodies, torch.full((1, 3), 0.5), conditions)

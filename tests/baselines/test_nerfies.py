@@ -121,7 +121,7 @@ def evaluate(field: NerfiesField, training: bool) -> RaySamples:
     """Evaluate one ray that passes from above through the upright column."""
     fit = three_poses()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
-    conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.arange(3), 2.5)
+    conditions = Conditions.of(bodies, torch.arange(3), 2.5)
     ray = Rays(torch.tensor([[0.5, 0.4, 5.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long))
     still = Draws.deterministic(1, field.samples, torch.device("cpu"))
     draws = Draws.random(1, field.samples, 0.0, torch.Generator().manual_seed(0)) if training else still

@@ -37,7 +37,7 @@ def posed(field: NeuralBodyField, root: torch.Tensor | None = None) -> tuple[Pos
     theta, root = fit.theta[rows], fit.root if root is None else root[None]
     moment = torch.arange(3) if len(theta) == 3 else torch.tensor([-1])
     bodies = PosedBodies(fit.rig, theta, root, field.canonical_m)
-    return bodies, Conditions.of(fit.rig, theta, root, moment, 2.5)
+    return bodies, Conditions.of(bodies, moment, 2.5)
 
 
 def look(field: NeuralBodyField, region: NeuralBodyRegion, rows: list[int]) -> torch.Tensor:

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from hnerf.body.canonical import PosedBodies
 from hnerf.fields.conditions import Conditions, Draws
 from tests.body.two_bone import two_bone_rig
 
@@ -12,7 +13,8 @@ def test_conditions_by_hand() -> None:
     theta, root = torch.arange(9.0).view(1, 3, 3), torch.eye(4)[None].clone()
     root[0, :2, :2] = torch.tensor([[0.0, -1], [1, 0]])
     root[0, :3, 3] = torch.tensor([1.0, 2, 3])
-    found = Conditions.of(two_bone_rig(), theta, root, torch.tensor([5]), 2.0)
+    rig = two_bone_rig().to(dtype=torch.float32)
+    found = Conditions.of(PosedBodies(rig, theta, root, rig.vertices_m), torch.tensor([5]), 2.0)
     assert found.pose.tolist() == [[3, 4, 5]]
     assert found.root.tolist() == [[0, -1, 0, 0.5, 1, 0, 0, 1, 0, 0, 1, 1.5]]
     assert found.frame_row.tolist() == [5]

@@ -100,12 +100,11 @@ def test_a_frames_displacement_moves_distance_and_colour(moved_m: list[float]):
     field.deformation.displacement.data[1] = torch.tensor(moved_m)
     nn.init.normal_(field.field.geometry[-1].weight)
     nn.init.normal_(field.field.geometry_grids.features)
-    theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None]
-    bodies = PosedBodies(rig, theta, root, rig.vertices_m)
+    bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
     points_m = torch.tensor([[0.43, 0.51, 1.03], [0.55, 0.38, 1.01]])
 
     def seen(at_m: torch.Tensor, moment: int) -> torch.Tensor:
-        known = Conditions.of(rig, theta, root, torch.tensor([moment]), 2.5)
+        known = Conditions.of(bodies, torch.tensor([moment]), 2.5)
         distance_m = field.signed_distance(bodies, at_m, known)
         return torch.cat([distance_m[:, None], field.colour(bodies, at_m, at_m, known)], 1)
 

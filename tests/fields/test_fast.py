@@ -33,8 +33,8 @@ SETTINGS = FastFieldSettings(
 
 
 def standing() -> tuple[PosedBodies, Conditions]:
-    theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None]
-    return PosedBodies(RIG, theta, root, RIG.vertices_m), Conditions.of(RIG, theta, root, torch.zeros(1).long(), 2.5)
+    bodies = PosedBodies(RIG, torch.zeros(1, 2, 3), torch.eye(4)[None], RIG.vertices_m)
+    return bodies, Conditions.of(bodies, torch.zeros(1).long(), 2.5)
 
 
 def field_of(sharpness_per_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
@@ -246,7 +246,7 @@ def test_the_shell_moves_with_the_displacement_of_a_frame():
 
     def ends(moment: int) -> torch.Tensor:
         """Return the depths of the first and the last sample on a ray from above."""
-        moments = Conditions.of(RIG, bodies.theta, bodies.root, torch.tensor([moment]), 2.5)
+        moments = Conditions.of(bodies, torch.tensor([moment]), 2.5)
         depths, _, core = field.region(bodies, moments).sample_rays(
             from_above((0.5, 0.5, 3.0)), torch.full((1, 64), 0.5)
         )
@@ -459,7 +459,7 @@ def test_a_trunks_shirt_is_found_even_at_points_closer_to_the_arm() -> None:
     field = FastField(rig, SETTINGS, 1)
     field.log_sharpness.data.fill_(2000.0).log_()
     field.field.residual = lambda y, d, pose, row: torch.where(y[:, 0] < 1.1, -0.03, 0.0)
-    conditions = Conditions.of(rig, bodies.theta, bodies.root, torch.zeros(1).long(), 2.5)
+    conditions = Conditions.of(bodies, torch.zeros(1).long(), 2.5)
     point_m = torch.tensor([[1.025, 0.05, 0.2]])
     assert bodies.describe(point_m, torch.zeros(1).long(), 1.0).y[0, 0] > 1.1
     assert field.signed_distance(bodies, point_m, conditions).item() == pytest.approx(-0.005, abs=1e-5)

@@ -50,7 +50,7 @@ def no_residual(y_m: Tensor, d_m: Tensor, pose: Tensor, row: Tensor) -> Tensor:
 
 def sampled(field: FastField, probe: float | None = None, rig: Rig = RIG) -> RaySamples:
     bodies = PosedBodies(rig, THETA, ROOT, rig.vertices_m)
-    conditions = Conditions.of(rig, THETA, ROOT, torch.arange(2), 2.5)
+    conditions = Conditions.of(bodies, torch.arange(2), 2.5)
     draws = Draws(torch.full((1, 12), 0.5), torch.rand(1, 3), torch.zeros(1, 12))
     if probe is not None:
         draws = Draws(draws.jitter, draws.background, draws.fine, torch.tensor([probe]))

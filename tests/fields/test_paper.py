@@ -74,7 +74,8 @@ def field_of(static: bool = False, root: Tensor = ROOT, **changes: object) -> Pa
 
 
 def bodies(theta: Tensor = THETA, root: Tensor = ROOT) -> tuple[PosedBodies, Conditions]:
-    return PosedBodies(RIG, theta, root, RIG.vertices_m), Conditions.of(RIG, theta, root, torch.arange(2), 2.0)
+    posed = PosedBodies(RIG, theta, root, RIG.vertices_m)
+    return posed, Conditions.of(posed, torch.arange(2), 2.0)
 
 
 def sampled(field: PaperField, draws: Draws = DRAWS) -> tuple[RaySamples, Tensor]:

@@ -135,8 +135,8 @@ def test_hidden_and_grazing_vertices_are_not_visible() -> None:
 
 def test_rendering_a_training_camera_applies_its_gain(tmp_path: Path) -> None:
     capture, _, body = record(tmp_path)
-    avatar = Avatar(build_field(TINY.field, body, False), body, 1.0, body, {"0": (0.5, 1.0, 2.0)})
-    plain = Avatar(avatar.field, body, 1.0, body)
+    avatar = Avatar(build_field(TINY.field, body, False), body, body, {"0": (0.5, 1.0, 2.0)})
+    plain = Avatar(avatar.field, body, body)
     for name, gain in (("0", (0.5, 1.0, 2.0)), ("1", (1.0, 1.0, 1.0))):
         shown, expected = (a.render(capture.cameras[name], body.theta[0], body.root[0]).rgb for a in (avatar, plain))
         assert expected.max() > 0.1
