@@ -87,13 +87,6 @@ def test_sparse_distance_maps_interpolate_the_full_ones() -> None:
         np.testing.assert_allclose([*direction, distance_px], [1, 0, 52], atol=0.6)
 
 
-def test_normals_point_out_of_a_ball() -> None:
-    vertices, faces = ball(1.0, 0.0)
-    equator = np.abs(vertices[:, 2]) < 0.5
-    normals = normals_of(vertices, faces)
-    np.testing.assert_allclose(normals[equator], vertices[equator], atol=0.03)
-
-
 def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() -> None:
     """A ball of 0.2 m at 3 m with a focal length of 281.6 px has a radius of 18.8 px. The masks are 5 px larger and
     smaller."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from flows.cli import main
 from hnerf.avatar.trained import load_avatar
@@ -71,7 +72,7 @@ def test_images_grow_until_something_changes(page: Page, subject: Path) -> None:
     browser.settle()
     assert [picture.shape[1] for picture in browser.pictures][-2:] == [96, 150]
 
-    browser.camera.wxyz = quaternion_of(recorded.R.T)
+    browser.camera.wxyz = Rotation.from_matrix(recorded.R.T).as_quat(scalar_first=True)
     browser.pictures.clear()
     browser.moved(None)
     large = browser.settle()
@@ -172,12 +173,6 @@ def test_an_address_of_this_machine_is_accepted(host: str, subject: Path, monkey
     monkeypatch.setattr(viser, "ViserServer", lambda *given, **_: pytest.fail(f"served at {given[0]}"))
     with pytest.raises(pytest.fail.Exception, match=f"^served at {host}$"):
         main(["view", str(subject), "--host", host])
-
-
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
 def test_without_viser_the_error_names_the_extra(
