@@ -82,10 +82,10 @@ class DynamicField(BoxField):
         unseen = torch.zeros_like(self.codes[:1])
         return torch.cat([self.codes, unseen])[conditions.frame_row]  # -1 is the last row
 
-    def to_samples(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor, **extra: Any) -> RaySamples:
+    def to_samples(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor) -> RaySamples:
         """Build samples from density (R, K) and colour (R, K, 3) at depths (R, K); the last sample extends to the end
         of the box."""
-        return box_samples(self.opacity(density, depths_m, far_m), colour, self.pseudo_distance(density), **extra)
+        return box_samples(self.opacity(density, depths_m, far_m), colour, self.pseudo_distance(density))
 
 
 def box_samples(alpha: Tensor, colour: Tensor, d: Tensor, **given: Any) -> RaySamples:

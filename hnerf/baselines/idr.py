@@ -106,7 +106,7 @@ class IdrField(StaticField):
             norms = self._evaluate(lower + (upper - lower) * draws.fine[:, :3])[1].norm(dim=-1)
         alpha = hit[:, None].to(d)
         colour = torch.zeros_like(rays.origins_m).index_copy(0, pick, seen)[:, None]
-        samples = box_samples(alpha, colour, d, gradient_norm=norms, background=draws.background)
+        samples = box_samples(alpha, colour, d, gradient_norm=norms)
         return samples, surface_depths[:, None]
 
     def distance(self, points_m: Tensor) -> Tensor:

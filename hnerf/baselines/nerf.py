@@ -73,7 +73,6 @@ class NerfField(StaticField):
             alpha_dot=torch.cat([first_alpha, torch.zeros_like(alpha)], 1),
             colour=torch.cat([first_colour, colour], 1),
             d=self.pseudo_distance(torch.cat([first_density, density], 1)),
-            background=draws.background,
         )
         return samples, torch.cat([first, every], 1)
 

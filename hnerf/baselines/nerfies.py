@@ -81,7 +81,7 @@ class NerfiesField(DynamicField):
             code = self.code(scene.conditions)[rays.frame][:, None].expand(-1, depths_m.shape[1], -1)
             template = self._deform(self.scaled(points).flatten(0, 1), code.flatten(0, 1)).view_as(points)
             density, colour = self.template(template, rays.directions[:, None].expand_as(points))
-            return self.to_samples(density, colour, depths_m, far, background=draws.background)
+            return self.to_samples(density, colour, depths_m, far)
 
         with torch.no_grad():
             drawn = sample_pdf(first, near, far, weights_from_alpha(evaluate(first).alpha), draws.fine)

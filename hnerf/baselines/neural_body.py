@@ -118,7 +118,7 @@ class NeuralBodyField(DynamicField):
         features = self.trunk(self._features(scene.region, points, row))
         density = self._density(features).view_as(depths)
         colour = self._colour(features, points, view, row, scene.conditions).view(*depths.shape, 3)
-        return self.to_samples(density, colour, depths, far, background=draws.background), depths
+        return self.to_samples(density, colour, depths, far), depths
 
     def _features(self, region: NeuralBodyRegion, points_m: Tensor, row: Tensor) -> Tensor:
         """Return the diffused codes at points (N, 3) around bodies of rows (N,), concatenated over all levels."""

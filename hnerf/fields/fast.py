@@ -153,7 +153,7 @@ class FastField(Field):
         # Only samples that count are evaluated, one ray after another; slots: their places among all, (N,).
         slots = torch.nonzero((torch.arange(depths.shape[1], device=count.device) < count[:, None]).flatten())[:, 0]
         ray, depth_m = slots // depths.shape[1], depths.flatten()[slots]
-        row, background, beside_m = rays.frame[ray], draws.background, None
+        row, beside_m = rays.frame[ray], None
         if directions is not None:
             beside_m = (directions - rays.directions)[:, ray] * depth_m[:, None]
         bodies, pose, points_m = scene.bodies, scene.conditions.pose, rays.pick(ray).points(depth_m)
@@ -161,9 +161,7 @@ class FastField(Field):
         if directions is not None:
             many, depth_m = len(directions), depth_m.repeat(len(directions))
             slots = (slots + depths.numel() * torch.arange(many, device=slots.device)[:, None]).flatten()
-            depths, count, core, row, background = (
-                torch.cat([t] * many) for t in (depths, count, core, row, background)
-            )
+            depths, count, core, row = (torch.cat([t] * many) for t in (depths, count, core, row))
         met = torch.nonzero(count)[:, 0]  # the rays that have samples
         last = count.cumsum(0)[met] - 1
         ends = torch.zeros_like(row, dtype=torch.bool).index_fill(0, last, True)
@@ -199,7 +197,7 @@ class FastField(Field):
             elastic = on_rays(energy, 0.0).sum(1)[met] / count[met]
         in_box = on_rays(described.near, False).any(1, keepdim=True).expand_as(alpha).float()
         d, residual, surface_m = on_rays(d, self.reach_m), on_rays(residual, 0.0), on_rays(surface_m.detach(), 0.0)
-        found = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic, surface_m)
+        found = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, elastic, surface_m)
         return found, depths
 
     def render_beside(self, scene: PosedScene[ShellGrid], rays: Rays, directions: Tensor) -> Tensor:

@@ -107,7 +107,6 @@ class PaperField(Field):
             d=d,
             residual=residual,
             gradient_norm=norms,
-            background=torch.zeros_like(draws.background),
         )
 
     def _scaled(self, points_m: Tensor) -> Tensor:

@@ -11,9 +11,9 @@ class RaySamples:
     """A field evaluated along a batch of rays.
 
     alpha of the radiance field, alpha_dot of the SDF, in_box b, d of the body, residual dd. density: None if the SDF
-    itself is the density. gradient_norm: |grad d_hat| at some or all samples. background: the colour behind the
-    samples. elastic: deformation energy of the rays that have one, None without a deformation. surface_m: depths of the
-    surfaces whose colours the samples show, None if these are their own.
+    itself is the density. gradient_norm: |grad d_hat| at some or all samples. elastic: deformation energy of the rays
+    that have one, None without a deformation. surface_m: depths of the surfaces whose colours the samples show, None if
+    these are their own.
     """
 
     alpha: Float[Tensor, "R K"]
@@ -24,7 +24,6 @@ class RaySamples:
     d: Float[Tensor, "R K"]
     residual: Float[Tensor, "R K"]
     gradient_norm: Float[Tensor, "..."]
-    background: Float[Tensor, "R 3"]
     elastic: Float[Tensor, " E"] | None = None
     surface_m: Float[Tensor, "R K"] | None = None
 

@@ -35,7 +35,7 @@ class FixedRays:
         """Return the PSNR on the person's pixels of the frames in rows; None if none is drawn."""
         rays, samples = self.sample(scene, rows)
         mixed = rays.edge & (not self.field.models_background)  # mixed with a background that only such a field models
-        error = (box_colour(samples) - rays.colour)[rays.person & ~mixed]
+        error = (box_colour(samples, torch.zeros_like(rays.colour)) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean())) if len(error) else None
 
     @torch.no_grad()

@@ -20,45 +20,49 @@ EPSILON = 1e-6  # keeps logarithms finite
 
 @dataclass(frozen=True)
 class Target:
-    """Target of a batch: the observed colour; person M; weight: 0 excludes a ray from the colour losses."""
+    """Target of a batch: the observed colour; person M; weight: 0 excludes a ray from the colour losses; background:
+    the colour behind the samples."""
 
     colour: Float[Tensor, "R 3"]
     person: Float[Tensor, " R"]
     weight: Float[Tensor, " R"]
+    background: Float[Tensor, "R 3"]
 
 
-def pixel_colour(alpha: Float[Tensor, "R K"], samples: RaySamples) -> Float[Tensor, "R 3"]:
+def pixel_colour(
+    alpha: Float[Tensor, "R K"], samples: RaySamples, background: Float[Tensor, "R 3"]
+) -> Float[Tensor, "R 3"]:
     """Return the composited colour for one choice of opacity, over the background."""
     weights = weights_from_alpha(alpha)
-    return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * samples.background
+    return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * background
 
 
-def box_colour(samples: RaySamples) -> Float[Tensor, "R 3"]:
+def box_colour(samples: RaySamples, background: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
     """Return C~: the colour composited with b alpha."""
-    return pixel_colour(samples.in_box * samples.alpha, samples)
+    return pixel_colour(samples.in_box * samples.alpha, samples, background)
 
 
 def colour_errors(samples: RaySamples, target: Target) -> Float[Tensor, " R"]:
     """Return |C_gt - C|_1 of each ray; its mean over rays is rec."""
-    return target.weight * (target.colour - pixel_colour(samples.alpha, samples)).abs().sum(1)
+    return target.weight * (target.colour - pixel_colour(samples.alpha, samples, target.background)).abs().sum(1)
 
 
 def mask(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
     """Return mask: |M (C_gt - C~)|_1."""
-    error = (target.colour - box_colour(samples)).abs().sum(1)
+    error = (target.colour - box_colour(samples, target.background)).abs().sum(1)
     return (target.weight * target.person * error).mean()
 
 
 def fog(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
     """Return fog: |(1 - M) C~|_1, for fields that model the background, since rec takes fog in the box for
     background."""
-    return (target.weight * (1 - target.person) * box_colour(samples).sum(1)).mean()
+    return (target.weight * (1 - target.person) * box_colour(samples, target.background).sum(1)).mean()
 
 
 def blend(samples: RaySamples, target: Target, eta: float) -> Float[Tensor, ""]:
     """Return blend: |M (C_gt - C^)|_1 + eta |(1 - M)(C_gt - C^)|_1, C^ composited with b alpha_dot + (1 - b) alpha."""
     alpha = samples.in_box * samples.alpha_dot + (1 - samples.in_box) * samples.alpha
-    error = (target.colour - pixel_colour(alpha, samples)).abs().sum(1)
+    error = (target.colour - pixel_colour(alpha, samples, target.background)).abs().sum(1)
     return (target.weight * (target.person + eta * (1 - target.person)) * error).mean()
 
 

@@ -33,7 +33,7 @@ class Objective(nn.Module):
 
     def forward(self, scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> tuple[dict[str, Tensor], Tensor]:
         """Return the weighted losses by name, whose sum is minimised, and the colour errors of the rays (R,)."""
-        target, draws = make_target(rays, draws, self.field.models_background)
+        target = make_target(rays, draws.background, self.field.models_background)
         samples, depths_m = self.field.sample(dataclasses.replace(scene, correction=self.correction), rays, draws)
         s, gamma = self.settings.losses, self.field.gamma
         errors = losses.colour_errors(samples, target)
@@ -59,22 +59,22 @@ class Objective(nn.Module):
         return weighted, errors.detach()
 
 
-def make_target(rays: PixelRays, draws: Draws, models_background: bool) -> tuple[losses.Target, Draws]:
-    """Return the target of the rays, and the draws with the background behind their samples.
+def make_target(rays: PixelRays, drawn: Tensor, models_background: bool) -> losses.Target:
+    """Return the target of the rays.
 
     A field that models the background is compared with the photograph. Any other field is composited over the clean
-    plate, so that outline pixels, which mix person and plate, count, too; without a plate it is composited over random
-    colours, and the outline is left out.
+    plate, so that outline pixels, which mix person and plate, count, too; without a plate it is composited over drawn
+    colours (R, 3), and the outline is left out.
     """
     person = rays.person.float()
     everywhere = torch.ones_like(person)
     if models_background:
-        return losses.Target(rays.colour, person, everywhere), draws
+        return losses.Target(rays.colour, person, everywhere, torch.zeros_like(rays.colour))
     if rays.plate is not None:
         colour = torch.where((rays.person | rays.edge)[:, None], rays.colour, rays.plate)
-        return losses.Target(colour, person, everywhere), dataclasses.replace(draws, background=rays.plate)
-    colour = torch.where(rays.person[:, None], rays.colour, draws.background)
-    return losses.Target(colour, person, (~rays.edge).float()), draws
+        return losses.Target(colour, person, everywhere, rays.plate)
+    colour = torch.where(rays.person[:, None], rays.colour, drawn)
+    return losses.Target(colour, person, (~rays.edge).float(), drawn)
 
 
 def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int, processes: Distributed) -> str | None:

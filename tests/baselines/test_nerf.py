@@ -53,14 +53,13 @@ def fog() -> NerfField:
     return field
 
 
-def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
-    """Sample two rays over white: one through the middle of the box, 4 m of it inside, and one that misses it."""
+def look(field: NerfField, draws: Draws) -> tuple[RaySamples, Tensor]:
+    """Sample two rays: one through the middle of the box, 4 m of it inside, and one that misses it."""
     fit = body()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(bodies, torch.zeros(1, dtype=torch.long), 2.5)
     origins = torch.tensor([[-3.0, 0.5, 0.5], [-3.0, 5.0, 0.5]])
     rays = Rays(origins, torch.tensor([[1.0, 0, 0]]).repeat(2, 1), torch.zeros(2, dtype=torch.long))
-    draws = dataclasses.replace(jitter, background=torch.ones(2, 3))
     return field.sample(field.scene(bodies, conditions), rays, draws)
 
 
@@ -71,7 +70,7 @@ def test_coarse_and_fine_colours_by_hand(fog: NerfField) -> None:
     zero = torch.zeros(2, 24)
     samples, depths = look(fog, dataclasses.replace(still, jitter=zero, fine=zero))
     assert samples.alpha.shape == depths.shape == (2, 72)
-    target = Target(torch.zeros(2, 3), torch.ones(2), torch.ones(2))
+    target = Target(torch.zeros(2, 3), torch.ones(2), torch.ones(2), background=torch.ones(2, 3))
     fine, coarse = 0.75 + 0.25 * math.exp(-4), 0.25 + 0.75 * math.exp(-1)
     assert colour_errors(samples, target).mean().item() == pytest.approx(3 * (fine + 1) / 2, abs=1e-4)
     assert blend(samples, target, 1.0).item() == pytest.approx(3 * (coarse + 1) / 2, abs=1e-4)

@@ -292,7 +292,7 @@ def test_padding_changes_nothing(ends_in_core: bool, spacing_m: float) -> None:
         own = Draws(**picked | {"jitter": picked["jitter"][:, :samples]})
         found, depths = field.sample(scene, rays.pick(torch.tensor(which)), own)
         assert found.elastic is not None
-        total = pixel_colour(found.alpha, found).sum() + found.elastic.sum() + found.gradient_norm.sum()
+        total = pixel_colour(found.alpha, found, own.background).sum() + found.elastic.sum() + found.gradient_norm.sum()
         parameters = [field.deformation.displacement, *field.field.parameters()]  # type: ignore[union-attr]
         gradients = torch.autograd.grad(total + torch.relu(-found.d_hat).sum(), parameters, allow_unused=True)
         images = composited(found, depths), found.elastic, found.gradient_norm, torch.relu(-found.d_hat).sum(1)
@@ -410,7 +410,7 @@ def test_colour_gradients_by_the_body_position_match_finite_differences():
         correction.move_m = move_m[None]
         scene = PosedScene(bodies, field.region(bodies, conditions), conditions, correction)
         samples, _ = field.sample(scene, rays, draws)
-        return pixel_colour(samples.alpha, samples)[0]
+        return pixel_colour(samples.alpha, samples, draws.background)[0]
 
     step_m = 1e-4
     steps = [(colour(step_m * axis) - colour(-step_m * axis)) / (2 * step_m) for axis in torch.eye(3)]

@@ -19,7 +19,7 @@ def sample(scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> tuple[RaySa
     in_box = torch.tensor([0.0, 1.0]).expand(len(rays), 2)
     colour = torch.tensor([[1.0] * 3, [102 / 255] * 3]).expand(len(rays), 2, 3)
     nothing = torch.zeros(len(rays), 2)
-    return RaySamples(ones, ones, in_box, colour, None, ones, nothing, torch.zeros(0), draws.background), None
+    return RaySamples(ones, ones, in_box, colour, None, ones, nothing, torch.zeros(0)), None
 
 
 def psnr(levels: list[int], person: list[bool], edge: list[bool], models_background: bool) -> float | None:

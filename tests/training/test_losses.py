@@ -23,10 +23,9 @@ SAMPLES = RaySamples(
     d=torch.tensor([[0.05, 0.01], [0.10, 0.20]]),
     residual=torch.tensor([[-0.02, -0.03], [0.04, -0.05]]),
     gradient_norm=torch.tensor([1.5, 0.8]),
-    background=torch.tensor([BLACK, BLACK]),
     elastic=torch.tensor([0.2]),
 )
-TARGET = Target(colour=torch.tensor([RED, BLACK]), person=torch.tensor([1.0, 0.0]), weight=torch.ones(2))
+TARGET = Target(torch.tensor([RED, BLACK]), torch.tensor([1.0, 0.0]), torch.ones(2), torch.tensor([BLACK, BLACK]))
 DOUBLE = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items() if v is not None})
 DOUBLE_TARGET = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
 

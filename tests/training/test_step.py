@@ -22,37 +22,37 @@ PERSON = torch.tensor([True, True, False, False])
 EDGE = torch.tensor([False, True, True, False])
 
 
-def target_and_draws(plate: Tensor | None, models_background: bool = False) -> tuple[losses.Target, Draws]:
-    """Return the target and draws of four pixels: in the person, on both sides of the outline, in the background."""
+def target_of(plate: Tensor | None, models_background: bool = False) -> losses.Target:
+    """Return the target of four pixels: in the person, on both sides of the outline, in the background."""
     none = torch.zeros(4, 3)
     rays = PixelRays(none, none, torch.zeros(4, dtype=torch.long), SEEN, PERSON, EDGE, plate)
-    return make_target(rays, Draws(none, BEYOND, none), models_background)
+    return make_target(rays, BEYOND, models_background)
 
 
 @pytest.mark.parametrize("plate", [None, PLATE])
 def test_the_target_of_a_field_with_background_is_the_photograph(plate: Tensor | None) -> None:
-    target, draws = target_and_draws(plate, models_background=True)
+    target = target_of(plate, models_background=True)
     assert torch.equal(target.colour, SEEN)
     assert target.weight.tolist() == [1, 1, 1, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
-    assert draws.background is BEYOND
+    assert not target.background.any()
 
 
 def test_over_a_clean_plate_every_pixel_counts() -> None:
     """Outline pixels, which mix person and plate, keep the photographed colour; background pixels get the plate's."""
-    target, draws = target_and_draws(PLATE)
+    target = target_of(PLATE)
     assert torch.equal(target.colour, torch.cat([SEEN[:3], PLATE[3:]]))
     assert target.weight.tolist() == [1, 1, 1, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
-    assert torch.equal(draws.background, PLATE)
+    assert torch.equal(target.background, PLATE)
 
 
 def test_without_a_plate_surroundings_are_random_and_the_outline_is_left_out() -> None:
-    target, draws = target_and_draws(None)
+    target = target_of(None)
     assert torch.equal(target.colour[[0, 3]], torch.stack([SEEN[0], BEYOND[3]]))
     assert target.weight.tolist() == [1, 0, 0, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
-    assert torch.equal(draws.background, BEYOND)
+    assert torch.equal(target.background, BEYOND)
 
 
 def objective_terms(
