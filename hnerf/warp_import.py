@@ -11,7 +11,7 @@ wp.config.enable_backward = False
 
 
 def refuse_second_derivatives() -> None:
-    """Raise RuntimeError in the backward pass of a kernel if that pass is to be differentiated in turn: torch would take
-    its result for a constant, without a word."""
+    """Raise RuntimeError in the backward pass of a kernel if that pass is to be differentiated in turn: torch would
+    take its result for a constant, without a word."""
     if torch.is_grad_enabled():
         raise RuntimeError("kernels of warp have no second derivatives here; use finite differences")
