@@ -77,12 +77,13 @@ def test_each_loss_gets_its_own_inputs_and_weight() -> None:
     s = LossSettings(
         **{"reconstruction": 2, "mask": 3, "blend": 5, "geometry": 7, "segmentation": 11, "eikonal": 13},
         **{"residual": 17, "fit": 19, "increment": 23, "elastic": 29, "eta": 0.25},
+        geometry_roles="print",
     )
     expected = {
         "reconstruction": 2 * 0.475,
         "mask": 3 * 0.375,
         "blend": 5 * 1.025,
-        "geometry": 7 * losses.geometry(SAMPLES, 50.0, 0.02, "surface_leads").item(),
+        "geometry": 7 * losses.geometry(SAMPLES, 50.0, 0.02, 80.0, "print").item(),
         "segmentation": 11 * losses.segmentation(SAMPLES.d_hat, TARGET, 80.0).item(),
         "eikonal": 13 * 0.145,
         "residual": 17 * 0.02,

@@ -38,10 +38,15 @@ def claim_lines(result: Result) -> list[str]:
 
 def more_is_better(result: Result) -> Iterator[Finding]:
     """Check, for every method, that scores are better with the most cameras or frames than with the fewest, and never
-    drop between consecutive values by more than seed noise."""
+    drop between consecutive values by more than seed noise. Where a method has no score but another has, the claim is
+    not supported."""
     for key, (_, _, sign) in FIGURES.items():
-        for name, curve in sweep_curves(result, key).items():
+        curves = sweep_curves(result, key)
+        counts = {count for curve in curves.values() for count, _ in curve}
+        for name, curve in curves.items():
             values = [value for _, value in curve]
+            for count in sorted(counts - dict(curve).keys()):
+                yield False, f"{count:g} {result['sweep']}: {name} nothing"
             if len(values) > 1:
                 falls = any(_falls(key, *step) for step in itertools.pairwise(values))
                 yield sign * (values[-1] - values[0]) > 0 and not falls, f"{name} {_shown(key, *values)}"
@@ -66,8 +71,8 @@ def loses_least(result: Result) -> Iterator[Finding]:
 
 
 def ahead(result: Result) -> Iterator[Finding]:
-    """Check that H-NeRF has better scores than each other method in every variant. If H-NeRF was run and has no score,
-    the claim is not supported."""
+    """Check that H-NeRF has better scores than each other method in every variant, by however little. If H-NeRF was run
+    and has no score, the claim is not supported."""
     for title, variant in result["variants"].items():
         for key, (_, _, sign) in FIGURES.items():
             values = {name: pick(scores[scores["split"]], key) for name, scores in scored_methods(variant).items()}

@@ -69,6 +69,14 @@ def test_more_is_better_at_every_step(psnr: tuple[float, ...], chamfer: tuple[fl
     assert verdict(result).startswith(seen)
 
 
+def test_more_is_not_better_for_a_method_that_fails_with_more() -> None:
+    """nerf fails with eight cameras."""
+    result = without_fast("more_is_better", 8)
+    methods = result["variants"]["8 cameras"]["methods"]
+    methods["fast"], methods["nerf"] = of_method(30.5, 0.08, 0.9, 8, 0.1), methods["fast"]
+    assert verdict(result).startswith("no: fast 28.0, 30.0, 30.5 dB; 8 cameras: nerf nothing; nerf 20.0, 26.0 dB; fast")
+
+
 @pytest.mark.parametrize("check", ["more_is_better", "loses_least"])
 def test_variants_that_calibration_left_with_the_same_cameras_show_nothing(check: str) -> None:
     """Of four cameras, calibration leaves out two."""
