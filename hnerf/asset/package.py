@@ -10,15 +10,16 @@ A second avatar, of the captured mesh, adds a variant set `topology`. All other 
 variants, and the names of payloads and images start with the variant's name.
 """
 
-import struct
+import os
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile, is_zipfile
+from zipfile import is_zipfile
 
 import numpy as np
 from pxr import Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
@@ -32,7 +33,7 @@ from hnerf.body.descriptor import normals_of
 from hnerf.capture.capture import write_image
 from hnerf.geometry.camera import Camera
 
-FIRST_TIME = bytes([0, 0, 0x21, 0])  # midnight, 1 January 1980, in ZIP's time and date
+FIRST_TIME_S = time.mktime((1980, 1, 1, 0, 0, 0, 0, 0, -1))  # the earliest that ZIP can store, which has local times
 INTERFACE, PAYLOADS = "avatar.usda", "avatar"
 
 Variant = tuple[str, str]  # the variant set and the name in it
@@ -263,9 +264,10 @@ def _package(stage: Usd.Stage, avatars: Avatars, path: Path) -> None:
     layer = Path(stage.GetRootLayer().realPath)
     _save(stage)
     _write_images(layer.parent, avatars)
+    for file in layer.parent.iterdir():  # the package keeps their times; the same avatar is to give the same bytes
+        os.utime(file, (FIRST_TIME_S, FIRST_TIME_S))
     if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)) or not is_zipfile(path):
         raise OSError(f"{path}: USD could not write the package; is the disk full?")
-    _forget_times(path)
 
 
 def _write_images(folder: Path, avatars: Avatars) -> None:
@@ -277,20 +279,3 @@ def _write_images(folder: Path, avatars: Avatars) -> None:
             write_image(folder / f"{prefix}{usd.LIGHT_NAME}", avatar.albedo.dome[0])
         if avatar.normal_map is not None:
             write_image(folder / f"{prefix}{usd.NORMAL_MAP_NAME}", avatar.normal_map)
-
-
-def _forget_times(path: Path) -> None:
-    """Set the times of all files in a package to the earliest that ZIP can store, so that the same avatar gives the
-    same bytes.
-
-    APPNOTE.TXT of PKWARE, 4.3.7 and 4.3.12: time and date are at byte 10 of a local header and at byte 12 of a
-    directory entry. The lengths of an entry's name, extra field and comment are at byte 28.
-    """
-    package = bytearray(path.read_bytes())
-    with ZipFile(path) as archive:
-        at, entries = archive.start_dir, archive.infolist()
-    for entry in entries:
-        for place in (entry.header_offset + 10, at + 12):
-            package[place : place + 4] = FIRST_TIME
-        at += 46 + sum(struct.unpack_from("<3H", package, at + 28))
-    path.write_bytes(package)
