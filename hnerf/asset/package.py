@@ -13,7 +13,7 @@ variants, and the names of payloads and images start with the variant's name.
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -65,13 +65,13 @@ class Part:
     topology: Variant | None
 
 
-def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
+def write_package(out: Path, avatars: Avatars, cameras: Sequence[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar.usda`, the same at each of the avatar's rates (`avatar_24.usda`) and with MaterialX, and the folder
     `avatar/` into `out`."""
     folder = out / PAYLOADS
     folder.mkdir()
     _write_images(folder, avatars)
-    parts, networks = _parts(avatars, list(cameras), fps), list(_networks(avatars, fps))
+    parts, networks = list(_parts(avatars, cameras, fps)), list(_networks(avatars, fps))
     for part in (*parts, *networks):
         layer = Usd.Stage.CreateNew(str(folder / f"{part.name}.usdc"))
         _set_units(layer, part.fps)
@@ -84,20 +84,20 @@ def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: f
         _write_interface(out / f"avatar_{rate}.usda", parts, avatars, rate, info, f"{CAPTURED}_{rate}")
 
 
-def write_usdz(path: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
+def write_usdz(path: Path, avatars: Avatars, cameras: Sequence[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar.usdz`: the same prims and variants as the package in a single layer, and the texture."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         layer = Path(folder) / "avatar.usdc"
         stage = _new_stage(layer, path.name, avatars, _time_range(avatars, CAPTURED, fps), fps, info)
         _describe(stage, info)
-        for part in _parts(avatars, list(cameras), fps):
+        for part in _parts(avatars, cameras, fps):
             with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
                 part.author(stage)
         _select(stage, avatars, CAPTURED)
         _package(stage, avatars, path)
 
 
-def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
+def write_cache(path: Path, avatar: StagedAvatar, cameras: Sequence[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar_cache.usdz`: the surface as world-space points at every frame, for programs without skinning."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         layer = Path(folder) / "avatar_cache.usdc"
@@ -129,33 +129,29 @@ def _variant(topology: str) -> Variant | None:
     return ("topology", topology) if topology else None
 
 
-def _parts(avatars: Avatars, cameras: list[Camera], fps: float) -> list[Part]:
-    """Return the parts of the package, inside the variants of `topology` if there are several. Earlier parts override
+def _parts(avatars: Avatars, cameras: Sequence[Camera], fps: float) -> Iterator[Part]:
+    """Yield the parts of the package, inside the variants of `topology` if there are several. Earlier parts override
     later ones: shapes replace the extents of motions."""
-    return [part for topology, avatar in avatars.items() for part in _parts_of(topology, avatar, cameras, fps)]
-
-
-def _parts_of(topology: str, avatar: StagedAvatar, cameras: list[Camera], fps: float) -> Iterator[Part]:
-    """Yield the parts of one topology."""
-    prefix, outer = _prefix(topology), _variant(topology)
-    for name, physique in {CAPTURED: None, **{name: name for name in avatar.physiques_m}}.items():
-        author = partial(usd.author_shape, avatar=avatar, physique=physique)
-        yield Part(f"{prefix}shape_{name}", author, fps, ("shape", name), outer)
-    for level in range(len(avatar.levels)):
-        author = partial(usd.author_geometry, avatar=avatar, level=level)
-        yield Part(f"{prefix}geometry_lod{level}", author, fps, ("lod", f"lod{level}"), outer)
-    meshes = [usd.surface_path(level) for level in range(len(avatar.levels))]
-    for name in avatar.looks:
-        author = partial(usd.author_look, name=name, meshes=meshes, avatar=avatar, prefix=prefix)
-        yield Part(f"{prefix}look_{name}", author, fps, ("look", name), outer)
-    author = partial(usd.author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
-    yield Part(f"{prefix}cameras", author, fps, None, outer)
-    for name, rig in avatar.rigs.items():
-        author = partial(usd.author_rig, name=name, rig=rig, avatar=avatar)
-        yield Part(f"{prefix}rig_{name}", author, fps, ("rig", name), outer)
-    for name, motion in avatar.rigs[FULL].motions.items():
-        author = partial(usd.author_motion, name=name, avatar=avatar)
-        yield Part(f"{prefix}motion_{name}", author, motion.fps, ("motion", name), outer)
+    for topology, avatar in avatars.items():
+        prefix, outer = _prefix(topology), _variant(topology)
+        for name, physique in {CAPTURED: None, **{name: name for name in avatar.physiques_m}}.items():
+            author = partial(usd.author_shape, avatar=avatar, physique=physique)
+            yield Part(f"{prefix}shape_{name}", author, fps, ("shape", name), outer)
+        for level in range(len(avatar.levels)):
+            author = partial(usd.author_geometry, avatar=avatar, level=level)
+            yield Part(f"{prefix}geometry_lod{level}", author, fps, ("lod", f"lod{level}"), outer)
+        meshes = [usd.surface_path(level) for level in range(len(avatar.levels))]
+        for name in avatar.looks:
+            author = partial(usd.author_look, name=name, meshes=meshes, avatar=avatar, prefix=prefix)
+            yield Part(f"{prefix}look_{name}", author, fps, ("look", name), outer)
+        author = partial(usd.author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
+        yield Part(f"{prefix}cameras", author, fps, None, outer)
+        for name, rig in avatar.rigs.items():
+            author = partial(usd.author_rig, name=name, rig=rig, avatar=avatar)
+            yield Part(f"{prefix}rig_{name}", author, fps, ("rig", name), outer)
+        for name, motion in avatar.rigs[FULL].motions.items():
+            author = partial(usd.author_motion, name=name, avatar=avatar)
+            yield Part(f"{prefix}motion_{name}", author, motion.fps, ("motion", name), outer)
 
 
 def _networks(avatars: Avatars, fps: float) -> Iterator[Part]:
