@@ -95,7 +95,7 @@ def export_asset(
     settings: AssetSettings,
     out: Path,
     digest: str = "",
-    further: Mapping[str, Motion] | None = None,
+    further: Mapping[str, Motion] = {},
     blender: str | None = None,
 ) -> dict[str, Any]:
     """Write the files that docs/asset.md lists into `out`; return the content of `report.json`.
@@ -107,10 +107,7 @@ def export_asset(
     """
     seconds: dict[str, float] = {}
     own = avatar.without_frames().body.to("cpu")  # the unclothed body, to which further motions are retargeted
-    added = {
-        name: (retarget(own, motion, capture.up, f"motion {name}"), motion.fps)
-        for name, motion in (further or {}).items()
-    }
+    added = {n: (retarget(own, motion, capture.up, f"motion {n}"), motion.fps) for n, motion in further.items()}
     meshes = _rest_meshes(avatar, settings, seconds)
     topology = chosen_topology(settings.topology, meshes.distances_mm["registered"])
     found = findings(settings.topology, meshes.distances_mm["registered"])

@@ -137,12 +137,12 @@ def stage_avatar(
     up: str,
     fps: float,
     bones: Bones = "along",
-    further: Mapping[str, tuple[BodyFit, float]] | None = None,
+    further: Mapping[str, tuple[BodyFit, float]] = {},
     albedo: Albedo | None = None,
     normal_map: np.ndarray | None = None,
     level_faces: Sequence[int] = (),
-    expressions_m: Mapping[str, np.ndarray] | None = None,
-    physiques_m: Mapping[str, np.ndarray] | None = None,
+    expressions_m: Mapping[str, np.ndarray] = {},
+    physiques_m: Mapping[str, np.ndarray] = {},
     joint_names: JointNames = OWN,
 ) -> StagedAvatar:
     """Turn a clothed body (see `clothed_rig`) and its motion to Y up, with both rigs. surfaces_m (n, V, 3): its surface
@@ -155,12 +155,12 @@ def stage_avatar(
     stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
     rest = RestSurface(rest_m - stands_m, correctives.offsets_m @ body.T.astype(np.float32))
     points_m = surfaces_m @ world.T.astype(np.float32)
-    motions = _motions(clothed, fps, correctives.weights, further or {}, world)
+    motions = _motions(clothed, fps, correctives.weights, further, world)
     floor_m = float(np.median(points_m[..., 1].min(1)))  # the median, since some frames have a foot centimetres lower
     rigs = stage_rigs(rig, joints_m - stands_m, rest, motions, floor_m, bones)
     return StagedAvatar(
         rest_points_m=rest.points_m,
-        levels=levels_of(rest.points_m, rig.faces.numpy(), layout, level_faces, expressions_m or {}),
+        levels=levels_of(rest.points_m, rig.faces.numpy(), layout, level_faces, expressions_m),
         shapes_m=rest.shapes_m,
         expressions_m=_turned(expressions_m, body),
         physiques_m=_turned(physiques_m, body),
@@ -181,9 +181,9 @@ def shape_names(avatar: StagedAvatar) -> list[str]:
     return [f"corrective_{k + 1:02d}" for k in range(len(avatar.shapes_m))]
 
 
-def _turned(shapes_m: Mapping[str, np.ndarray] | None, rotation: np.ndarray) -> dict[str, np.ndarray]:
-    """Turn blend shapes (V, 3), by name, if there are any."""
-    return {name: moved_m @ rotation.T.astype(np.float32) for name, moved_m in (shapes_m or {}).items()}
+def _turned(shapes_m: Mapping[str, np.ndarray], rotation: np.ndarray) -> dict[str, np.ndarray]:
+    """Turn blend shapes (V, 3), by name."""
+    return {name: moved_m @ rotation.T.astype(np.float32) for name, moved_m in shapes_m.items()}
 
 
 def box(points_m: np.ndarray) -> np.ndarray:

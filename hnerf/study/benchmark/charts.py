@@ -25,7 +25,6 @@ CHARACTERS_PER_INCH = 13
 
 Curves = Mapping[str, Sequence[Point]]
 Style = dict[str, Any]
-NO_REASONS: Mapping[str, str] = {}
 CLOUD: Style = {"linestyle": "none", "markersize": 3.5, "alpha": 0.35, "markeredgewidth": 0}
 FRONT: Style = {"color": INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "zorder": 1, "scalex": False, "scaley": False}
 
@@ -142,7 +141,7 @@ def picture_grid(rows: Sequence[tuple[str, Sequence[tuple[str, Any]]]], caption:
 
 
 def draw_curves(
-    axes: Axes, curves: Curves, method_styles: Mapping[str, Style], end_reasons: Mapping[str, str] = NO_REASONS
+    axes: Axes, curves: Curves, method_styles: Mapping[str, Style], end_reasons: Mapping[str, str] = {}
 ) -> None:
     """Draw a line per method, with its name at the end. If there is a reason why a line ends, write it next to the name
     and mark the end with a large marker and a bar."""
@@ -175,7 +174,7 @@ def _label_points(
     axes: Axes,
     method_styles: Mapping[str, Style],
     lift: float = 0.0,
-    end_reasons: Mapping[str, str] = NO_REASONS,
+    end_reasons: Mapping[str, str] = {},
 ) -> None:
     """Write names to the right of their points, with the reasons why their curves end. Labels are raised by `lift`
     typographic points, and further where they would overlap."""
