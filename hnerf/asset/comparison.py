@@ -58,7 +58,26 @@ def compare_with_field(
     surfaces = _skinned_surfaces(staged, [view.frame for view in seen])
 
     def compare(view: View) -> Compared:
-        return _compared(capture, view, seen[view], avatar, staged, surfaces[view.frame], splats)
+        mask, surface = seen[view], surfaces[view.frame]
+        box = mask_box(mask)
+        camera = camera_of_box(capture.cameras[view.camera], box)
+        small = camera.scaled(min(1.0, max(LONGEST_PX / max(camera.size_px), SHORTEST_PX / min(camera.size_px))))
+        cast = camera.scaled(min(1.0, 2 * max(small.size_px) / max(camera.size_px)))  # a large box has millions of rays
+        photograph = capture.image(view.camera, view.frame)[box] * mask[box][..., None]
+        photograph = cv2.resize(photograph, small.size_px, interpolation=cv2.INTER_AREA)
+        shown = cv2.resize(255 * mask[box].astype(np.uint8), small.size_px, interpolation=cv2.INTER_AREA) > 127
+        with torch.no_grad():
+            field = rgba(avatar.render(small, *avatar.body.pose(view.frame)))
+        gain = avatar.gains.get(view.camera, (1.0, 1.0, 1.0))
+        renders = {"field": field} | looks_on_black(surface, staged, cast, small.size_px, gain)
+        if splats:
+            points_m = np.asarray(surface.mesh.vertices)
+            renders["splats"] = splats_on_black(splats, points_m, cast, small.size_px, gain)
+        scores = {name: _scores(render, photograph, shown) for name, render in renders.items()}
+        if splats:
+            drawn, by_field = (renders[name][..., :3].astype(np.float32) / 255 for name in ("splats", "field"))
+            scores["splats"]["psnr_to_field"] = psnr(drawn, by_field)
+        return Compared(view, photograph, renders, scores)
 
     compared = side_by_side(compare, list(seen), avatar.body.theta.device)
     return list(tracked(compared, "asset against field", len(seen)))
@@ -130,36 +149,6 @@ def _skinned_surfaces(staged: StagedAvatar, frames: list[int]) -> dict[int, Surf
     moved = staged.rigs[FULL].surfaces_m(CAPTURED, staged.rest, rows)
     surfaces = (Surface.of(points_m @ staged.stage_from_world, staged.faces) for points_m in moved)
     return dict(zip(wanted, surfaces, strict=True))
-
-
-def _compared(
-    capture: Capture,
-    view: View,
-    mask: np.ndarray,
-    avatar: Avatar,
-    staged: StagedAvatar,
-    surface: Surface,
-    splats: Splats | None,
-) -> Compared:
-    box = mask_box(mask)
-    camera = camera_of_box(capture.cameras[view.camera], box)
-    small = camera.scaled(min(1.0, max(LONGEST_PX / max(camera.size_px), SHORTEST_PX / min(camera.size_px))))
-    cast = camera.scaled(min(1.0, 2 * max(small.size_px) / max(camera.size_px)))  # a large box has millions of rays
-    photograph = capture.image(view.camera, view.frame)[box] * mask[box][..., None]
-    photograph = cv2.resize(photograph, small.size_px, interpolation=cv2.INTER_AREA)
-    shown = cv2.resize(255 * mask[box].astype(np.uint8), small.size_px, interpolation=cv2.INTER_AREA) > 127
-    with torch.no_grad():
-        field = rgba(avatar.render(small, *avatar.body.pose(view.frame)))
-    gain = avatar.gains.get(view.camera, (1.0, 1.0, 1.0))
-    renders = {"field": field} | looks_on_black(surface, staged, cast, small.size_px, gain)
-    if splats:
-        points_m = np.asarray(surface.mesh.vertices)
-        renders["splats"] = splats_on_black(splats, points_m, cast, small.size_px, gain)
-    scores = {name: _scores(render, photograph, shown) for name, render in renders.items()}
-    if splats:
-        drawn, by_field = (renders[name][..., :3].astype(np.float32) / 255 for name in ("splats", "field"))
-        scores["splats"]["psnr_to_field"] = psnr(drawn, by_field)
-    return Compared(view, photograph, renders, scores)
 
 
 def _scores(rendered: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> dict[str, float]:

@@ -57,7 +57,9 @@ def write_report(
             name=name,
             frame=frame,
             has_viewer=(path.parent / "viewer.html").exists(),
-            moving=moving_uri(list(side_by_side(partial(_textured, surface, avatar), turns)), TURN_MS),
+            moving=moving_uri(
+                list(side_by_side(lambda camera: textured(shoot(surface, camera), avatar), turns)), TURN_MS
+            ),
             turntable=[captioned(f"{360 * k // STILLS}°", textured(shot, avatar)) for k, shot in enumerate(shots)],
             surface=[
                 captioned("Clay, front", clay(front)),
@@ -82,11 +84,6 @@ def write_report(
         ),
         encoding="utf-8",
     )
-
-
-def _textured(surface: Surface, avatar: StagedAvatar, camera: Camera) -> np.ndarray:
-    """Render a posed surface of the avatar with its texture, as a camera sees it."""
-    return textured(shoot(surface, camera), avatar)
 
 
 def _joints(shot: Shot, name: str, rig: StagedRig, row: int) -> GalleryPicture:
