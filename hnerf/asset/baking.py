@@ -38,7 +38,7 @@ class Filled:
     def of(cls, texels: Texels, unseen: np.ndarray, texture_px: int) -> "Filled":
         """Return the mask of texels unseen (N,) bool."""
         mask = np.zeros((texture_px, texture_px), np.uint8)
-        mask[texels.row.numpy(), texels.column.numpy()] = 255 * unseen
+        mask[texels.row, texels.column] = 255 * unseen
         return cls(mask, float(unseen.mean()))
 
 
@@ -102,5 +102,5 @@ def _coarse_field_colours(
     side_px = min(texture_px, max(LEAST_FIELD_PX, texture_px // 2))
     coarse = rasterise(layout, side_px)
     image = texture_image(coarse, field_colours(avatar, posed, coarse, cavities), side_px)
-    at = np.stack([texels.column.numpy(), texels.row.numpy()], 1)
+    at = np.stack([texels.column, texels.row], 1)
     return sampled(image, (at + 0.5) * side_px / texture_px - 0.5)

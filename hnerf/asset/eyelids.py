@@ -29,6 +29,6 @@ def with_plain_lids(colours: np.ndarray, texels: Texels, rig: Rig, units_m: Mapp
     areas_m2 = [cotangent_laplacian(vertices_m, faces)[0] for vertices_m in (open_m, closed_m)]
     unfolds = ((areas_m2[1] / areas_m2[0] - STRETCH[0]) / (STRETCH[1] - STRETCH[0])).clip(0, 1)
     moved = np.any([np.linalg.norm(units_m[name], axis=1) > MOVED_M for name in (*BLINKS, *BROWS)], 0)
-    spoilt = moved[faces].any(1)[texels.face.numpy()]
+    spoilt = moved[faces].any(1)[texels.face]
     plain = filled(np.where(spoilt[:, None], np.nan, colours), texels, rig)
     return colours + texels.interpolate(unfolds[:, None], faces) * (plain - colours)

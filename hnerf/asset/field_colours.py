@@ -55,7 +55,7 @@ def filled(colours: np.ndarray, texels: Texels, rig: Rig) -> np.ndarray:
     if not unknown.any() or unknown.all():
         return np.nan_to_num(colours)
     faces, vertices_m = rig.faces.numpy(), rig.vertices_m.double().numpy()
-    corners, share = faces[texels.face.numpy()], texels.barycentric.double().numpy()
+    corners, share = faces[texels.face], texels.barycentric.astype(np.float64)
     at, by = corners[~unknown], share[~unknown]
     weight = np.bincount(at.ravel(), by.ravel(), len(vertices_m))
     total = [np.bincount(at.ravel(), (by * c[:, None]).ravel(), len(vertices_m)) for c in colours[~unknown].T]
@@ -76,10 +76,11 @@ def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, ro
     theta, root = theta.to(device), root.to(device)
     surface_m, normals = move_onto_surface(avatar, vertices_m, faces, theta, root)  # skinning only approximates it
     on_surface = outer.to(device) & (avatar.signed_distance(surface_m, theta, root).abs() <= OFF_SURFACE_M)
-    shown = torch.nonzero(on_surface[faces].all(1)[texels.face.to(device)])[:, 0]
-    corners, weights = faces[texels.face.to(device)[shown]], texels.barycentric.to(device)[shown, :, None]
+    face, barycentric = (torch.from_numpy(values).to(device) for values in (texels.face, texels.barycentric))
+    shown = torch.nonzero(on_surface[faces].all(1)[face])[:, 0]
+    corners, weights = faces[face[shown]], barycentric[shown, :, None]
     points_m = (surface_m[corners] * weights).sum(1)
     inward = -torch.nn.functional.normalize((normals[corners] * weights).sum(1), dim=1)
-    colours = torch.full((len(texels.face), 3), torch.nan)
+    colours = torch.full((len(face), 3), torch.nan)
     colours[shown.cpu()] = avatar.colour(points_m, inward, theta, root).cpu()
     return colours

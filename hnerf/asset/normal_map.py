@@ -33,7 +33,7 @@ def normal_map(avatar: Avatar, mesh: AssetMesh, layout: UvLayout, side_px: int) 
     trust = ((cosine - COSINES[0]) / (COSINES[1] - COSINES[0])).clip(0, 1)
     trust *= (1 - np.abs(distance_m) / OFF_SURFACE_M).clip(0, 1)
     if mesh.base is not None:
-        trust *= 1 - (mesh.base.hidden[faces[texels.face]] * texels.barycentric.numpy()).sum(1)
+        trust *= 1 - (mesh.base.hidden[faces[texels.face]] * texels.barycentric).sum(1)
     components = frames.components(smooth + trust[:, None] * (gradient - smooth))
     return texture_image(texels, (components + 1) / 2, side_px)
 
@@ -46,6 +46,7 @@ def _field_normals(avatar: Avatar, rig: Rig, texels: Texels) -> tuple[np.ndarray
     theta, root = avatar.body.theta.new_zeros(len(rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
     faces = rig.faces.to(device)
     surface_m, _ = move_onto_surface(avatar, rig.vertices_m.to(device), faces, theta, root)
-    points_m = (surface_m[faces[texels.face.to(device)]] * texels.barycentric.to(device)[..., None]).sum(1)
+    face, barycentric = (torch.from_numpy(values).to(device) for values in (texels.face, texels.barycentric))
+    points_m = (surface_m[faces[face]] * barycentric[..., None]).sum(1)
     normals, distances_m = normals_and_distances(avatar, points_m, theta, root, STEP_M)
     return normals.double().cpu().numpy(), distances_m.double().cpu().numpy()

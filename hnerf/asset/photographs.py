@@ -170,7 +170,7 @@ def visible_texels(
     towards = camera.centre_m - vertices_m
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = ((normals * towards).sum(1) > 0)[faces].any(1)
-    index = np.flatnonzero(facing[texels.face.numpy()])
+    index = np.flatnonzero(facing[texels.face])
     points_m, normal = np.hsplit(texels.interpolate(np.hstack([vertices_m, normals]), faces, index), 2)
     pixels_px, depth_m = camera.project(points_m)
     view_m = camera.centre_m.astype(points_m.dtype) - points_m

@@ -5,10 +5,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 import xatlas
 from scipy.ndimage import distance_transform_edt
-from torch import Tensor
 
 from hnerf.geometry.rays import cast, mesh_on_cpu
 
@@ -30,14 +28,14 @@ class UvLayout:
 class Texels:
     """The covered texels of a texture: row, column (N,) from the image's top left, face (N,), barycentric (N, 3)."""
 
-    row: Tensor
-    column: Tensor
-    face: Tensor
-    barycentric: Tensor
+    row: np.ndarray
+    column: np.ndarray
+    face: np.ndarray
+    barycentric: np.ndarray
 
     def interpolate(self, per_vertex: np.ndarray, faces: np.ndarray, index: np.ndarray | slice = ALL) -> np.ndarray:
         """Interpolate vertex values (V, C) on faces (F, 3) at the texels of an index, (M, C)."""
-        corners, share = faces.take(self.face.numpy()[index], 0).T, self.barycentric.numpy()[index].T[..., None]
+        corners, share = faces.take(self.face[index], 0).T, self.barycentric[index].T[..., None]
         # One corner at a time takes half the time of all three at once, and `take` half that of indexing.
         a, b, c = (per_vertex.take(at, 0) * by for at, by in zip(corners, share, strict=True))
         return a + b + c
@@ -77,8 +75,8 @@ def rasterise(layout: UvLayout, texture_px: int) -> Texels:
     area = weights.sum(1, keepdims=True)
     # If faces only touch a texel, its centre lies outside them.
     inside = np.clip(weights / np.where(area == 0, 1, area), 0, None) + 1e-9
-    barycentric = torch.from_numpy(inside / inside.sum(1, keepdims=True)).float()
-    return Texels(torch.from_numpy(row), torch.from_numpy(column), torch.from_numpy(face).long(), barycentric)
+    barycentric = (inside / inside.sum(1, keepdims=True)).astype(np.float32)
+    return Texels(row, column, face.astype(np.int64), barycentric)
 
 
 def texture_image(texels: Texels, colours: np.ndarray, texture_px: int) -> np.ndarray:
@@ -86,9 +84,8 @@ def texture_image(texels: Texels, colours: np.ndarray, texture_px: int) -> np.nd
     border."""
     image = np.zeros((texture_px, texture_px, 3), np.uint8)
     covered = np.zeros((texture_px, texture_px), bool)
-    row, column = texels.row.numpy(), texels.column.numpy()
-    image[row, column] = np.round(colours.clip(0, 1) * 255)
-    covered[row, column] = True
+    image[texels.row, texels.column] = np.round(colours.clip(0, 1) * 255)
+    covered[texels.row, texels.column] = True
     nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
     return image[nearest[0], nearest[1]]
 

@@ -89,7 +89,7 @@ def test_the_field_fills_what_no_photograph_shows(pictures: dict[int, np.ndarray
     white = filled.mask[texels.row, texels.column] == 255
     assert filled.share == white.mean() and 0.5 < filled.share < 0.9
     assert (filled.mask == 255).sum() == white.sum()
-    assert white[away[texels.face.numpy()]].mean() > 0.95 and white[~away[texels.face.numpy()]].mean() < 0.6
+    assert white[away[texels.face]].mean() > 0.95 and white[~away[texels.face]].mean() < 0.6
 
 
 def test_there_is_no_albedo_without_photographs() -> None:
@@ -109,7 +109,7 @@ def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
     surfaces_m, layout = body.vertices_m().double().numpy(), unwrap(vertices_m, faces, 64)
     capture = Pictured(**vars(figure.capture()), pictures=pictures)
     texels = rasterise(layout, 64)
-    z_m = vertices_m[faces[texels.face.numpy()]][..., 2]
+    z_m = vertices_m[faces[texels.face]][..., 2]
     for photographs in (0, 3):
         settings, shown = SETTINGS.model_copy(update={"photograph_frames": photographs}), []
         for cavities in (figure.no_cavities(body), vertices_m[:, 2] > 0.85):

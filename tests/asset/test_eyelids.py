@@ -1,5 +1,4 @@
 import numpy as np
-import torch
 import trimesh
 
 from hnerf.asset.eyelids import BLINKS, BROWS, with_plain_lids
@@ -24,7 +23,7 @@ def test_a_lid_that_unfolds_has_the_colour_of_plain_skin_and_not_of_the_brow() -
     units_m["eyeBlinkLeft"][COLUMNS + np.arange(3, 7), 1] = 2
     units_m["browInnerUp"][COLUMNS + 9, 2] = 0.01
     count = len(strip.faces)
-    texels = Texels(*torch.zeros(2, count).long(), torch.arange(count), torch.full((count, 3), 1 / 3))
+    texels = Texels(*np.zeros((2, count), int), np.arange(count), np.full((count, 3), 1 / 3, np.float32))
     square = np.tile(k, 2)
     photographed = np.tile(RED, (count, 1))
     photographed[(square >= 3) & (square <= 5)], photographed[square == 8] = BLACK, BLUE

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from hnerf.asset import photographs
 from hnerf.asset.photographs import (
@@ -43,8 +42,8 @@ def square(half_m: float, z_m: float) -> np.ndarray:
 
 def texels_at(face: list[int], barycentric: list[list[float]]) -> Texels:
     """Return texels at given faces and barycentric coordinates."""
-    place = torch.zeros(len(face), dtype=torch.long)
-    return Texels(place, place, torch.tensor(face), torch.tensor(barycentric))
+    place = np.zeros(len(face), int)
+    return Texels(place, place, np.array(face), np.array(barycentric, np.float32))
 
 
 MIDDLE = [0.5, 0.5, 0.0]  # half-way between corners 0 and 2: the square's centre

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import torch
 
 from hnerf.asset.tangents import Frames, corner_angles, frames_at, uv_tangents
 from hnerf.asset.texture import Texels, UvLayout
@@ -63,7 +62,7 @@ def test_components_of_a_direction() -> None:
 
 def test_tangent_frames_inside_a_mirrored_face() -> None:
     mirrored = layout((1, 0), (0, 0), (0, 1), (1, 1))
-    texels = Texels(torch.zeros(1), torch.zeros(1), torch.tensor([0]), torch.full((1, 3), 1 / 3))
+    texels = Texels(*np.zeros((3, 1), int), np.full((1, 3), 1 / 3))
     normals = normals_of(SQUARE_M, HALVES)
     frame = frames_at(texels, normals, HALVES, mirrored, uv_tangents(SQUARE_M, normals, HALVES, mirrored))
     axes = [frame.normal[0], frame.tangent[0], frame.bitangent[0]]
