@@ -111,6 +111,8 @@ def test_splats_look_like_the_asset_and_are_scored_against_photograph_and_field(
     (found,) = compare_with_field(recorded, masks_of((4,)), avatar, shown, surface_splats(shown, 20_000))
     inside = found.renders["asset"][..., 3] == 255
     assert np.abs(found.renders["splats"][inside].astype(int) - (50, 100, 255, 255)).mean() < 3
+    covered = [found.renders[name][..., 3] > 127 for name in ("splats", "asset")]
+    assert np.mean(covered[0] != covered[1]) < 0.02 * inside.mean() + 0.003
     assert found.scores["splats"]["psnr"] == pytest.approx(found.scores["asset"]["psnr"], abs=0.5)
     off = (found.renders["splats"][..., :3].astype(float) - 90) / 255  # the field is uniformly grey
     assert found.scores["splats"]["psnr_to_field"] == pytest.approx(-10 * np.log10((off**2).mean()), abs=1e-3)

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.asset.figures import splat_figures
 from hnerf.asset.package import write_splats
-from hnerf.asset.pictures import looks_on_black, splats_on_black
 from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.skinning import Skin, skinned
 from hnerf.asset.splat_ply import write_splat_ply
@@ -16,8 +15,7 @@ from hnerf.asset.splats import OPACITY, SPREAD, Splats, evenly_on_faces, surface
 from hnerf.asset.staging import CAPTURED, StagedAvatar
 from hnerf.asset.validation import data_defects, validate_package
 from hnerf.body.descriptor import normals_of
-from hnerf.geometry.mesh_queries import Surface
-from tests.asset.figure import INFO, side_camera
+from tests.asset.figure import INFO
 
 COUNT = 500
 SPLATS = "/Avatar/Splats"
@@ -211,15 +209,3 @@ def test_each_defect_of_splats_is_reported(layer: Path, attribute: str, value: o
     found = stage.GetPrimAtPath(SPLATS).GetAttribute(attribute)
     found.Set(value, 4.0 if found.GetNumTimeSamples() else Usd.TimeCode.Default())
     assert message in "; ".join(data_defects(stage))
-
-
-def test_rendered_splats_look_like_the_rendered_mesh(staged: StagedAvatar) -> None:
-    grey = dataclasses.replace(staged, texture=np.full((64, 64, 3), 120, np.uint8))
-    found, camera, gain = surface_splats(grey, 20_000), side_camera().scaled(0.5), (0.5, 1.0, 3.0)
-    points_m = staged.points_m[1].astype(float) @ staged.stage_from_world
-    drawn = splats_on_black(found, points_m, camera, camera.size_px, gain)
-    surface = Surface.of(points_m, staged.faces)
-    mesh = looks_on_black(surface, grey, camera, camera.size_px, gain)["asset"]
-    inside = mesh[..., 3] == 255
-    assert np.abs(drawn[inside].astype(int) - (60, 120, 255, 255)).max(1).mean() < 3
-    assert np.mean((drawn[..., 3] > 127) != (mesh[..., 3] > 127)) < 0.02 * inside.mean() + 0.003

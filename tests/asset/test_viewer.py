@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hnerf.asset.compact_glb import read_glb
+from hnerf.asset.compact_glb import as_glb, read_glb
 from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.viewer import MAX_BYTES, _modules, lower_indices, recording, write_viewer
@@ -24,7 +24,6 @@ from hnerf.geometry.mesh_queries import Surface
 from hnerf.models import THREE_SHA256, has_model
 from tests.asset.browser import Page, browser, found_browser
 from tests.asset.figure import FRAMES, INFO, capture, side_camera
-from tests.asset.pages import with_joints_in_second_set
 
 NEEDS_THREE = pytest.mark.skipif(
     not all(map(has_model, THREE_SHA256)), reason="three.js is not installed; `hnerf models` fetches it"
@@ -433,3 +432,15 @@ def move(selector: str, value: float, event: str) -> str:
         f"(control => {{ control.value = {value}; control.dispatchEvent(new Event('{event}')); }})"
         f"(document.querySelector('{selector}'))"
     )
+
+
+def with_joints_in_second_set(glb: bytes) -> bytes:
+    """Return the file with four zero-weight influences inserted before those of each vertex."""
+    document, binary = read_glb(glb)
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    for name in ("JOINTS", "WEIGHTS"):
+        attributes[f"{name}_1"] = attributes[f"{name}_0"]
+        accessor = document["accessors"][attributes[f"{name}_1"]]
+        attributes[f"{name}_0"] = len(document["accessors"])
+        document["accessors"].append({key: accessor[key] for key in ("componentType", "count", "type")})  # zeros
+    return as_glb(document, binary)
