@@ -175,8 +175,7 @@ def author_motion(stage: Usd.Stage, name: str, avatar: StagedAvatar) -> None:
         weights = animation.CreateBlendShapeWeightsAttr()
         for k, code in enumerate(codes):
             translations.Set(vec3f(motion.translations_m[k]), code)
-            quaternions = [Gf.Quatf(w, x, y, z) for x, y, z, w in motion.quaternions[k].tolist()]
-            rotations.Set(Vt.QuatfArray(quaternions), code)
+            rotations.Set(Vt.QuatfArray.FromNumpy(motion.quaternions[k].astype(np.float32)), code)  # real part last
             weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(motion.shape_weights[k], np.float32)), code)
 
 
@@ -292,4 +291,4 @@ def extent(points_m: np.ndarray) -> Vt.Vec3fArray:
 
 
 def _matrices(transforms: np.ndarray) -> Vt.Matrix4dArray:
-    return Vt.Matrix4dArray([Gf.Matrix4d(*transform.T.ravel().tolist()) for transform in transforms])
+    return Vt.Matrix4dArray.FromNumpy(np.ascontiguousarray(transforms.swapaxes(1, 2)))
