@@ -1,7 +1,7 @@
 """Recordings without a calibration: where their images and keypoints lie, and what is known of their lenses."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -75,6 +75,7 @@ class Uncalibrated(Layout):
     only: str | None = None
     found_clocks: Mapping[str, Clock] | None = None
     calibrated: Layout | None = None
+    _opened: dict[str, Footage] = field(default_factory=dict, init=False)  # so far: opening a video decodes all of it
 
     @cached_property
     def known_lenses(self) -> dict[str, KnownLens]:
@@ -111,11 +112,6 @@ class Uncalibrated(Layout):
     @property
     def _files(self) -> Layout:
         return self.calibrated or EasyMocap(self.folder)
-
-    @cached_property
-    def _opened(self) -> dict[str, Footage]:
-        """Return the footage opened so far, as a cache: opening a video decodes all of it."""
-        return {}
 
     def keypoint_files(self, camera: str) -> dict[int, StoredFrame]:
         """Return openpose/<camera>/, else pose/<camera>_json/."""
