@@ -273,7 +273,7 @@ def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
         camera, raised = raised_above_ground(camera, keypoints, capture.up, capture.stature_m or USUAL_HEIGHT_M)
     reasons = size_reasons(capture, name) + intrinsics_reasons(camera)
     reasons += [raised] if raised else ground_reasons(camera, keypoints, capture.up, capture.stature_m)
-    timing = Timing.unknown("one camera")
+    timing = Timing(reason="one camera")
     verdict = CameraVerdict("refined" if raised else "ok", timing=timing, reasons=tuple(reasons))
     cameras = capture.cameras | {name: camera}
     return CalibrationReport(cameras, {name: verdict}, capture.up, notes, doubts(capture, keypoints[None], None))

@@ -18,7 +18,7 @@ from hnerf.results.files import write_result
 from hnerf.results.preparation import CalibrationCheck
 
 DECIMALS = 4  # of pixels, metres, frames and shares: a tenth of a millimetre, far below what is measured
-NO_KEYPOINTS = Timing.unknown("no keypoints")
+NO_KEYPOINTS = Timing(reason="no keypoints")
 SEVERITY = ("ok", "refined", "suspect", "rejected")
 
 

@@ -44,15 +44,10 @@ class Timing:
     reason: why the offset is not observable, else empty.
     """
 
-    offset_frames: float
-    error_frames: float
-    half_offsets: tuple[float, float]
-    reason: str
-
-    @staticmethod
-    def unknown(reason: str) -> "Timing":
-        """Return a timing that was not measured."""
-        return Timing(np.nan, np.nan, (0.0, 0.0), reason)
+    offset_frames: float = np.nan
+    error_frames: float = np.nan
+    half_offsets: tuple[float, float] = (0.0, 0.0)
+    reason: str = ""
 
     @property
     def suspected(self) -> bool:
@@ -203,7 +198,7 @@ def measure_timing(cameras: Sequence[Camera], keypoints: np.ndarray, frames: Seq
     """Measure each camera's time offset against the others. keypoints (C, frames, 25, 3); frames as recorded, in
     order."""
     if len(cameras) < 3:
-        return {camera.name: Timing.unknown("it takes two other cameras to place keypoints") for camera in cameras}
+        return {camera.name: Timing(reason="it takes two other cameras to place keypoints") for camera in cameras}
     return {camera.name: _timing(_view(cameras, keypoints, i, frames)) for i, camera in enumerate(cameras)}
 
 
@@ -237,11 +232,11 @@ def _timing(view: _View) -> Timing:
     enough = max(MIN_FRAMES, len(every) // 2)
     costs = _cost_by_step(view, [every, *halves], enough)
     if len(costs) < 3:
-        return Timing.unknown(f"fewer than {enough} frames in common")
+        return Timing(reason=f"fewer than {enough} frames in common")
     lowest, *lowest_of_half = (min(costs, key=lambda step: costs[step][part]) for part in range(3))
     parabola, step = _parabola(view, lowest), median_step(view.frames)
     if np.count_nonzero(parabola.weights) < MIN_FRAMES:
-        return Timing.unknown(f"fewer than {MIN_FRAMES} frames with neighbours {step} before and after")
+        return Timing(reason=f"fewer than {MIN_FRAMES} frames with neighbours {step} before and after")
     kept = [np.setdiff1d(every, left_out) for left_out in np.array_split(every, JACKKNIFE_BLOCKS)]
     error = _jackknife_error([parabola.vertex(k) for k in kept])
     curvature_px2 = parabola.curvature_px2(every)
