@@ -135,11 +135,7 @@ class Capture:
     def given_hands(self, camera: str) -> np.ndarray | None:
         """Return the left and right hands (frames, people, 2, 21, 3) of the people in `keypoints`, as the recording's
         own files have them; None if they have none. Only of a capture whose cameras are not synchronised yet."""
-        path = self.root / GIVEN_HANDS
-        if not path.exists():
-            return None
-        with np.load(path, allow_pickle=False) as stored:
-            return stored.get(camera)
+        return self._stored(GIVEN_HANDS, camera)
 
     def landmarks(self, camera: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Return a network's landmarks of people (frames, people, 33, 3) in the order of `frames`, each from the
@@ -154,12 +150,14 @@ class Capture:
         with np.load(path, allow_pickle=False) as found:
             return found["points_px"][rows], found["points_m"][rows]
 
-    def _points(self, file: str, camera: str) -> np.ndarray | None:
-        path = self.root / file
-        if not path.exists():
+    def _stored(self, file: str, camera: str) -> np.ndarray | None:
+        if not (self.root / file).exists():
             return None
-        with np.load(path, allow_pickle=False) as stored:
-            found = stored.get(camera)
+        with np.load(self.root / file, allow_pickle=False) as stored:
+            return stored.get(camera)
+
+    def _points(self, file: str, camera: str) -> np.ndarray | None:
+        found = self._stored(file, camera)
         if found is None or not self.stored_frames:
             return found
         instants = np.array(self.frames) + self.frame_offsets.get(camera, 0.0)
