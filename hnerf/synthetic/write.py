@@ -9,7 +9,7 @@ import numpy as np
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.descriptor import normals_of
-from hnerf.body.rig import Rig, joint_transforms, pose_vertices
+from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.body.skeletons import EQUIVALENTS, exported_name
 from hnerf.capture.body_25 import Body25
 from hnerf.capture.capture import to_8_bit, write_image
@@ -77,7 +77,8 @@ def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
     known = [rig.joint_names.index(name) for name in MIXAMO]
 
     def write_frame(frame: int) -> tuple[np.ndarray, np.ndarray]:
-        truth = _frame_truth(dressed, _pose(rig, frame, settings))
+        waving = np.clip((frame + 1 - settings.train_frames) / settings.fps / WAVING_AFTER_S, 0, 1)
+        truth = _frame_truth(dressed, walk_pose(rig, frame / settings.fps, float(waving)))
         for number, (name, view) in enumerate(views.items()):
             rng = np.random.default_rng((settings.seed, frame, number))
             _write_view(out, frame, view, truth, name in test_cameras, rng)
@@ -112,13 +113,6 @@ def ring_of_cameras(settings: SyntheticSettings) -> list[Camera]:
         like = Camera(name, np.diag([focal_px, focal_px, 1]), np.eye(3), np.zeros(3), size_px, size_px)
         cameras.append(look_at(like, centre_m, aim_m, up))
     return cameras
-
-
-def _pose(rig: Rig, frame: int, settings: SyntheticSettings) -> WalkPose:
-    """Return the pose of a frame."""
-    time_s = frame / settings.fps
-    waving = np.clip((frame + 1 - settings.train_frames) / settings.fps / WAVING_AFTER_S, 0, 1)
-    return walk_pose(rig, time_s, float(waving))
 
 
 def _frame_truth(dressed: DressedBody, pose: WalkPose) -> FrameTruth:
