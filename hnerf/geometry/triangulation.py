@@ -39,10 +39,9 @@ def triangulate(
     points_m = solve_points(projections, keypoints, confidence * inliers)
     residuals_px = reprojection_px(projections, points_m, keypoints)
     inliers &= np.isfinite(residuals_px)
-    points_m[inliers.sum(0) < 2] = np.nan
-    residuals_px[:, inliers.sum(0) < 2] = np.nan
+    lost = inliers.sum(0) < 2
+    points_m[lost], residuals_px[:, lost], inliers[:, lost] = np.nan, np.nan, False
     residuals_px[confidence == 0] = np.nan
-    inliers &= np.isfinite(residuals_px)
     return points_m.reshape(*shape[1:], 3), residuals_px.reshape(shape), inliers.reshape(shape)
 
 
