@@ -17,8 +17,7 @@ def anchors() -> np.ndarray:
     layers = []
     for cells, count in LAYERS:
         middles = (np.arange(cells) + 0.5) / cells
-        y, x = np.meshgrid(middles, middles, indexing="ij")
-        layers.append(np.stack([x, y], -1).reshape(-1, 2).repeat(count, 0))
+        layers.append(np.stack(np.meshgrid(middles, middles), -1).reshape(-1, 2).repeat(count, 0))
     return np.concatenate(layers)
 
 
