@@ -47,11 +47,10 @@ class _Shot(NamedTuple):
 
 
 class _Optics(NamedTuple):
-    """One camera of a model: its intrinsics as COLMAP's parameters."""
+    """One camera of a model: its intrinsics fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6."""
 
-    model: str
     size_px: tuple[int, int]
-    parameters: tuple[float, ...]
+    values: np.ndarray
 
 
 class Colmap(EasyMocap):
@@ -113,13 +112,9 @@ def _colmap_parameters(lens: Lens) -> tuple[str, list[float]]:
 
 def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
     """Return the lens of one image. Raises InputError if its camera cannot be used."""
-    _, places = MODELS[optics.model]
-    values = np.zeros(12)
-    for value, place in zip(optics.parameters, places, strict=True):
-        values[list(place)] = value
-    if values[9:].any():
+    if optics.values[9:].any():
         raise InputError(f"{sources[0]}: camera {shot.camera_id}: k4 to k6 are not supported; undistort its images")
-    fx, fy, cx, cy = values[:4]
+    fx, fy, cx, cy = optics.values[:4]
     quaternion = np.array(shot.pose[:4])
     norm = np.linalg.norm(quaternion)
     if not 0.5 < norm < 2:
@@ -128,7 +123,7 @@ def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
         source=sources[0],
         name=check_camera_name(PurePosixPath(shot.name.split("/")[0]).stem, sources[1]),
         K=np.array([[fx, 0, cx - PIXEL_CENTRE], [0, fy, cy - PIXEL_CENTRE], [0, 0, 1]]),
-        distortion=values[4:9],
+        distortion=optics.values[4:9],
         R=Rotation.from_quat(quaternion / norm, scalar_first=True).as_matrix(),
         t_m=np.array(shot.pose[4:]),
         size_px=optics.size_px,
@@ -214,6 +209,7 @@ def _shots_from_binary(path: Path) -> list[_Shot]:
 
 def _optics(model: str, width_px: int, height_px: int, parameters: tuple[float, ...]) -> _Optics:
     """Return a camera of the model. Raises ValueError if its number of parameters is wrong."""
-    if len(parameters) != len(MODELS[model][1]):
-        raise ValueError(model)
-    return _Optics(model, (width_px, height_px), parameters)
+    values = np.zeros(12)
+    for value, place in zip(parameters, MODELS[model][1], strict=True):
+        values[list(place)] = value
+    return _Optics((width_px, height_px), values)
