@@ -113,8 +113,7 @@ class PeopleSnapshot(Layout):
 
 def _array(path: Path, name: str, row_shape: tuple[int, ...]) -> np.ndarray:
     """Read all of a small dataset of rows as float64. Raises InputError unless it is of finite numbers."""
-    with _opened(path) as file:
-        data = _dataset(path, file, name)
+    with _dataset(path, name) as data:
         found = data[()].astype(np.float64) if data.size <= MAX_NUMBERS else np.zeros(())
     if found.ndim != 1 + len(row_shape) or found.shape[1:] != row_shape or not np.isfinite(found).all():
         raise InputError(f"{path}: {name} is not (N, {', '.join(map(str, row_shape))}) finite numbers; get it again")
@@ -123,35 +122,31 @@ def _array(path: Path, name: str, row_shape: tuple[int, ...]) -> np.ndarray:
 
 def _count(path: Path, name: str) -> int:
     """Return the number of rows of a dataset."""
-    with _opened(path) as file:
-        return len(_dataset(path, file, name))
+    with _dataset(path, name) as data:
+        return len(data)
 
 
 def _mask(path: Path, row: int) -> np.ndarray:
     """Read the mask of one frame, (H, W) uint8."""
-    with _opened(path) as file:
-        data = _dataset(path, file, "masks")
+    with _dataset(path, "masks") as data:
         if data.ndim != 3 or data.dtype.itemsize * math.prod(data.shape[1:]) > MAX_IMAGE_PIXELS:
             raise InputError(f"{path}: masks are not images (N, H, W); get it again")
         return 255 * (data[row] != 0).astype(np.uint8)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file. Raises InputError if it cannot be read."""
+def _dataset(path: Path, name: str) -> Iterator[h5py.Dataset]:
+    """Open a dataset of numbers in an HDF5 file. Raises InputError unless it can be read and lies in this very file, in
+    chunks of a sane size."""
     sys.audit("open", str(path), "r", 0)  # announced as Python's own open does
     try:
         with h5py.File(path, "r") as file:
-            yield file
+            data = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+            if not isinstance(data, h5py.Dataset) or data.ndim == 0 or data.dtype.kind not in "biuf":
+                raise InputError(f"{path}: has no array of numbers called {name}; get it again")
+            chunk_bytes = data.dtype.itemsize * math.prod(data.chunks or (1,))
+            if data.is_virtual or data.external or chunk_bytes > MAX_IMAGE_PIXELS:
+                raise InputError(f"{path}: {name} lies in other files, or in huge chunks; write it again")
+            yield data
     except (KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError):  # damage beyond the first bytes
         raise InputError(f"{path}: not a readable HDF5 file; get it again") from None
-
-
-def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """Return a dataset of numbers. Raises InputError unless it lies in this very file, in chunks of a sane size."""
-    data = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
-    if not isinstance(data, h5py.Dataset) or data.ndim == 0 or data.dtype.kind not in "biuf":
-        raise InputError(f"{path}: has no array of numbers called {name}; get it again")
-    if data.is_virtual or data.external or data.dtype.itemsize * math.prod(data.chunks or (1,)) > MAX_IMAGE_PIXELS:
-        raise InputError(f"{path}: {name} lies in other files, or in huge chunks; write it again")
-    return data
