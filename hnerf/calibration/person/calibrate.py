@@ -132,7 +132,7 @@ def calibrate_from_person(
             )
             scaled, points_m = scale_to(followed, measure(followed, straight).points_m, height)
         frame_s = median_step(capture.frames) / capture.fps
-        cameras, _, up_sd_deg = stand_on_ground(scaled, points_m, frame_s)
+        cameras, up_sd_deg = stand_on_ground(scaled, points_m, frame_s)
         uncertainty = _uncertainty(cameras, keypoints, unknown_focal, fit)
         _check_uncertainty(cameras, uncertainty)
     except InputError as error:

@@ -34,13 +34,12 @@ def scale_to(cameras: Sequence[Camera], points: np.ndarray, height_m: float) -> 
     return [dataclasses.replace(camera, t_m=scale * camera.t_m) for camera in cameras], scale * points
 
 
-def stand_on_ground(
-    cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float
-) -> tuple[list[Camera], np.ndarray, float]:
-    """Return the rig and its points (frames, 25, 3) in a world with Z up, the ground at 0 below the middle of the
-    person's path, and the first camera towards -Y; and the standard error of up in degrees.
+def stand_on_ground(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) -> tuple[list[Camera], float]:
+    """Return the rig in a world with Z up, the ground at 0 below the middle of the person's path, and the first camera
+    towards -Y; and the standard error of up in degrees.
 
-    frame_s: seconds between successive frames. Raises InputError if ankles and neck are never seen.
+    points_m (frames, 25, 3): of the person; frame_s: seconds between successive frames. Raises InputError if ankles and
+    neck are never seen.
     """
     world, up_sd = _upright(cameras, points_m, frame_s)
     turned_m = points_m @ world.T
@@ -54,7 +53,7 @@ def stand_on_ground(
         dataclasses.replace(camera, R=camera.R @ world.T, t_m=camera.t_m + camera.R @ world.T @ origin_m)
         for camera in cameras
     ]
-    return turned, points_m @ world.T - origin_m, float(np.rad2deg(up_sd))
+    return turned, float(np.rad2deg(up_sd))
 
 
 def _upright(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) -> tuple[np.ndarray, float]:
