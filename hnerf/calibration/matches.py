@@ -79,10 +79,8 @@ def _match_features(
     b: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
 ) -> np.ndarray:
     """Return the matches of two images' features, (n, 2, 2) pixels."""
-    rows = matcher.match(*a, *b)
-    in_a = [(a[0][int(i)].x, a[0][int(i)].y) for i, _ in rows]
-    in_b = [(b[0][int(j)].x, b[0][int(j)].y) for _, j in rows]
-    return np.stack([np.reshape(in_a, (-1, 2)), np.reshape(in_b, (-1, 2))], 1) - 0.5  # centres at integers
+    matched = [(a[0][int(i)], b[0][int(j)]) for i, j in matcher.match(*a, *b)]
+    return np.reshape([[(one.x, one.y) for one in pair] for pair in matched], (-1, 2, 2)) - 0.5  # centres at integers
 
 
 def _verified_matches(matched: np.ndarray) -> np.ndarray:
