@@ -102,8 +102,9 @@ def from_heatmaps(maps: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     for k, heat in enumerate(maps):
         row, column = divmod(int(heat.argmax()), columns)
         x, y = column + _from_peak(heat[row], column), row + _from_peak(heat[:, column], row)
-        points[k] = x * (size_px[0] - 1) / (columns - 1), y * (size_px[1] - 1) / (rows - 1), heat[row, column]
-    return _with_confidence(points)
+        peak = heat[row, column].clip(0, 1)
+        points[k] = x * (size_px[0] - 1) / (columns - 1), y * (size_px[1] - 1) / (rows - 1), peak
+    return points
 
 
 def _from_peak(line: np.ndarray, at: int) -> float:
@@ -119,10 +120,5 @@ def from_simcc(across: np.ndarray, down: np.ndarray, size_px: tuple[int, int]) -
     """Return the points (K, 3) of SimCC's (K, W r) and (K, H r): x, y in an input of (W, H) px, and the lower of the
     two peaks, in [0, 1] (Li et al. 2022)."""
     ratio = across.shape[1] / size_px[0]
-    peaks = np.minimum(across.max(1), down.max(1))
-    return _with_confidence(np.column_stack([across.argmax(1) / ratio, down.argmax(1) / ratio, peaks]))
-
-
-def _with_confidence(points: np.ndarray) -> np.ndarray:
-    points[:, 2] = points[:, 2].clip(0, 1)
-    return points
+    peaks = np.minimum(across.max(1), down.max(1)).clip(0, 1)
+    return np.column_stack([across.argmax(1) / ratio, down.argmax(1) / ratio, peaks])
