@@ -40,12 +40,11 @@ def write_recording(
     for name, frames in keypoints.items():
         place = folder / (f"pose/{name}_json" if pose2sim else f"openpose/{name}")
         pictures = folder / "images" / name
-        place.mkdir(parents=True), pictures.mkdir(parents=True)
+        pictures.mkdir(parents=True)
         grey = Image.new("RGB", (side_px, side_px), (90, 90, 90))
         for frame, points in enumerate(frames):
             grey.save(pictures / f"{frame:06d}.jpg", quality=20)
-            person = {"pose_keypoints_2d": points.ravel().tolist()}
-            (place / f"{frame:06d}_keypoints.json").write_text(json.dumps({"people": [person]}))
+            rec.write_keypoints(place / f"{frame:06d}_keypoints.json", [points])
     return folder
 
 
