@@ -28,10 +28,9 @@ def triangulate(
     """
     shape, keypoints = keypoints.shape[:-1], keypoints.reshape(len(cameras), -1, 3)
     projections, confidence = np.stack([camera.projection for camera in cameras]), confidence_of(keypoints)
-    best = [_best_pair(projections, keypoints[:, i : i + CHUNK], confidence[:, i : i + CHUNK])
-            for i in range(0, keypoints.shape[1], CHUNK)]  # fmt: skip
-    pair_points = np.concatenate([points for points, _ in best]) if best else np.zeros((0, 3))
-    in_pair = np.concatenate([members for _, members in best], 1) if best else confidence > 0
+    parts = [slice(i, i + CHUNK) for i in range(0, max(1, keypoints.shape[1]), CHUNK)]
+    best = [_best_pair(projections, keypoints[:, part], confidence[:, part]) for part in parts]
+    pair_points, in_pair = np.concatenate([p for p, _ in best]), np.concatenate([members for _, members in best], 1)
     distances = reprojection_px(projections, pair_points, keypoints)
     third_views_px = distances[(confidence > 0) & ~in_pair & np.isfinite(distances)]
     inlier_px = max(MIN_INLIER_PX, 4 * float(np.median(third_views_px))) if third_views_px.size else np.inf
