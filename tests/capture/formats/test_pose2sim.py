@@ -11,7 +11,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import exported_lenses, ingest
-from hnerf.capture.keypoint_sets import is_body_25, to_body_25
+from hnerf.capture.keypoint_sets import is_body_25
 from hnerf.config import CaptureSettings
 from tests.capture import recordings as rec
 from tests.shared_data import shared_capture
@@ -30,11 +30,6 @@ def test_real_detections_become_body_25(balance: Capture) -> None:
     # The person is upright in every frame: neck above hips, hips above the standing leg's knee, knee above its ankle.
     person = keypoints[:, np.argmax(keypoints[..., 2].sum(-1).mean(0))]
     assert (np.diff(person[:, [1, 8, 13, 14], 1], axis=1) > 0).all()
-
-
-def test_body_25_keypoints_are_left_unchanged(balance: Capture) -> None:
-    keypoints = balance.keypoints("cam03")
-    assert keypoints is not None and np.array_equal(to_body_25({"cam03": keypoints}, None)["cam03"], keypoints)
 
 
 def test_defects_of_the_real_capture_are_recorded(balance: Capture) -> None:
