@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import cv2
 import numpy as np
@@ -48,7 +48,7 @@ class ImageFolder:
 
     path: Path
     files: dict[int, Path]
-    fps: float | None = None
+    fps: ClassVar[None] = None  # images state none
 
     @property
     def frames(self) -> tuple[int, ...]:

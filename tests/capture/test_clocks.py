@@ -11,7 +11,7 @@ import pytest
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.clocks import Clock, in_step, read_clocks, write_clocks
-from hnerf.capture.footage import ImageFolder, Video
+from hnerf.capture.footage import Video
 from hnerf.capture.ingest import ingest
 from hnerf.capture.uncalibrated import Uncalibrated
 from hnerf.config import CaptureSettings
@@ -20,12 +20,13 @@ from tests.capture.mp4 import hold_frames, write_video
 from tests.capture.recordings import HEIGHT, WIDTH, write_easymocap
 
 
-def images(name: str, count: int, fps: float) -> ImageFolder:
-    return ImageFolder(Path(name), {frame: Path(name) / f"{frame}.jpg" for frame in range(count)}, fps)
+def recorded(name: str, count: int, fps: float) -> Video:
+    """Return a video without time stamps."""
+    return Video(Path(name), tuple(range(count)), fps)
 
 
 def test_instants_are_the_frames_of_the_slowest_camera_by_hand() -> None:
-    footage = {"a": images("a", 10, 10), "b": images("b", 10, 5)}
+    footage = {"a": recorded("a", 10, 10), "b": recorded("b", 10, 5)}
     found = in_step(footage, {"a": Clock(0.25), "b": Clock(0.0)}, 30)
     # b's frame k shows the instant k / 5 s, when a's clock shows k / 5 + 0.25 s: its frame 2 k + 2.5, up to 9.5.
     assert found["a"].own == pytest.approx({0: 2.5, 1: 4.5, 2: 6.5, 3: 8.5})
@@ -36,35 +37,33 @@ def test_a_drift_moves_later_frames_and_that_of_the_slowest_camera_is_removed_by
     """b drifts by 90 s x 100 ppm = 9 ms in 900 frames of 100 ms. If a's clock is 100 ppm fast, its frame 900 is at 90 /
     1.0001 s, and b has 20 frames a second."""
     for fps, a, b, own in ((10, Clock(), Clock(0.0, 1.0001), 900.09), (20, Clock(0.0, 1.0001), Clock(), 1800 / 1.0001)):
-        found = in_step({"a": images("a", 1001, 10), "b": images("b", 100 * fps + 1, fps)}, {"a": a, "b": b}, 30)
+        found = in_step({"a": recorded("a", 1001, 10), "b": recorded("b", 100 * fps + 1, fps)}, {"a": a, "b": b}, 30)
         assert found["b"].own[900] == pytest.approx(own, abs=1e-6)
 
 
 def test_footage_at_even_rates_without_clocks_is_unchanged() -> None:
-    footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
+    footage = {"a": recorded("a", 10, 10), "b": recorded("b", 10, 10)}
     found = in_step(footage, {}, 30)
     assert {name: one.source for name, one in found.items()} == footage
     assert [one.own for one in found.values()] == [{frame: frame for frame in range(10)}] * 2
 
 
 def test_missing_images_are_not_replaced_by_images_of_another_time() -> None:
-    whole, gap = images("a", 20, 10), images("b", 20, 10)
-    for frame in (5, 6, 7):
-        del gap.files[frame]
+    whole, gap = recorded("a", 20, 10), Video(Path("b"), (*range(5), *range(8, 20)), 10)
     found = in_step({"a": whole, "b": gap}, {"a": Clock(), "b": Clock(0.04)}, 30)
     assert found["a"].frames == (*range(5), *range(8, 20))  # at instant 7, b's nearest image is 0.06 s away
 
 
 def test_uneven_frames_are_all_used_and_none_replaces_a_dropped_one() -> None:
     video = Video(Path("b"), (0, 1, 2, 3, 4, 5), None, (0.0, 0.1, 0.24, 0.3, 0.6, 0.7))  # two dropped after 0.3 s
-    found = in_step({"a": images("a", 7, 10), "b": video}, {"a": Clock(), "b": Clock(0.06)}, 30)
+    found = in_step({"a": recorded("a", 7, 10), "b": video}, {"a": Clock(), "b": Clock(0.06)}, 30)
     # a's instants 1, 3 and 4 are 0.16, 0.36 and 0.46 s: 0.06, 0.06 and 0.14 s from a frame; 1 is between neighbours
     assert found["b"].own == pytest.approx({0: 0.6, 1: 1 + 6 / 14, 2: 2 + 2 / 6, 5: 3 + 26 / 30, 6: 4.6})
 
 
 def test_of_equally_slow_cameras_one_with_even_frames_sets_the_instants() -> None:
     video = Video(Path("a"), (0, 1, 2, 3, 4), None, (0.0, 0.1, 0.2, 0.3, 0.6))
-    found = in_step({"a": video, "b": images("b", 7, 10)}, {}, 30)
+    found = in_step({"a": video, "b": recorded("b", 7, 10)}, {}, 30)
     assert found["a"].frames == (0, 1, 2, 3, 6)  # b's numbers; a's frame 4 is at 0.6 s
 
 
@@ -72,7 +71,7 @@ def test_an_uneven_video_that_sets_the_instants_gets_a_warning(caplog: pytest.Lo
     """Of a's 13 frames, six take 0.1 s and six 0.2 s: by an even rate, its frame 6 would be 0.3 s late, at 0.9 s. b has
     20 frames a second."""
     times_s = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8)
-    found = in_step({"a": Video(Path("a"), tuple(range(13)), 12 / 1.8, times_s), "b": images("b", 37, 20)}, {}, 30)
+    found = in_step({"a": Video(Path("a"), tuple(range(13)), 12 / 1.8, times_s), "b": recorded("b", 37, 20)}, {}, 30)
     assert found["a"].frames == tuple(range(13)) and found["b"].own[7] == pytest.approx(16)
     assert "a: frames come up to 0.3 s off an even rate" in caplog.text
 
@@ -99,7 +98,7 @@ def test_videos_of_different_lengths_or_rates_are_left_to_be_refused() -> None:
 
 
 def test_recordings_that_do_not_overlap_and_missing_clocks_are_refused() -> None:
-    footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
+    footage = {"a": recorded("a", 10, 10), "b": recorded("b", 10, 10)}
     with pytest.raises(InputError, match="do not overlap"):
         in_step(footage, {"a": Clock(), "b": Clock(5.0)}, 30)
     with pytest.raises(InputError, match="camera b is missing"):
