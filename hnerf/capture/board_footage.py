@@ -292,12 +292,10 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
             raise InputError(f"{path}: camera {name} has a video and a folder of images; keep one of them")
         if path.is_file():
             found[name] = Video.open(path)
-            continue
-        files = safe_io.files_in(folder, "calibration", part, path.name, suffixes=safe_io.IMAGE_SUFFIXES)
-        if not files:  # such as the CHARUCO/ that Caliscope leaves here
+        elif files := safe_io.files_in(folder, "calibration", part, path.name, suffixes=safe_io.IMAGE_SUFFIXES):
+            found[name] = ImageFolder(path, safe_io.numbered(files, "images"))
+        else:  # such as the CHARUCO/ that Caliscope leaves here
             log.warning("%s: holds no JPEG or PNG images; ignored", path)
-            continue
-        found[name] = ImageFolder(path, safe_io.numbered(files, "images"))
     return found
 
 
