@@ -75,10 +75,9 @@ def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], unknown: Sequenc
     """Return keypoints (C, ..., 3) without the distortion k1 (OpenCV's) of the cameras named in `unknown`."""
     straight = keypoints.copy()
     for i, camera in enumerate(cameras):
-        if camera.name not in unknown or not k1:
-            continue
-        seen = keypoints[i, ..., 2] > 0
-        straight[i, seen] = undistort_keypoints(keypoints[i, seen], camera.K, np.array([k1, 0, 0, 0]))
+        if camera.name in unknown and k1:
+            seen = keypoints[i, ..., 2] > 0
+            straight[i, seen] = undistort_keypoints(keypoints[i, seen], camera.K, np.array([k1, 0, 0, 0]))
     return straight
 
 
