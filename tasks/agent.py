@@ -21,20 +21,15 @@ def main(failure: Path, arguments: list[str]) -> None:
     try:
         run(parse_args(arguments))
         code = 0
-    except ChildFailedError as error:
-        _, first = error.get_first_failure()
-        failure.write_text(json.dumps([first.local_rank, first.exitcode]))
-        _complain()
-    except BaseException:
-        _complain()
+    except BaseException as error:
+        if isinstance(error, ChildFailedError):
+            _, first = error.get_first_failure()
+            failure.write_text(json.dumps([first.local_rank, first.exitcode]))
+        with suppress(OSError):  # the caller may be gone
+            traceback.print_exc()
+            sys.stderr.flush()
     finally:
         os._exit(code)
-
-
-def _complain() -> None:
-    with suppress(OSError):  # the caller may be gone
-        traceback.print_exc()
-        sys.stderr.flush()
 
 
 if __name__ == "__main__":
