@@ -120,14 +120,10 @@ def in_stages(store: Store, pattern: str) -> Iterator[Path]:
 def _latest(store: Store) -> dict[str, dict[str, str]]:
     """Return the names of the artifacts to which each subject's links point."""
     folders = sorted(path for path in (store.root / "subjects").glob("*") if path.is_dir())
-    return {folder.name: dict(_links(folder)) for folder in folders}
-
-
-def _links(folder: Path) -> Iterator[tuple[str, str]]:
-    for stage in STAGES:
-        link = folder / stage
-        if link.is_symlink():
-            yield stage, f"{stage}/{Path(os.readlink(link)).name}"
+    return {
+        folder.name: {s: f"{s}/{Path(os.readlink(folder / s)).name}" for s in STAGES if (folder / s).is_symlink()}
+        for folder in folders
+    }
 
 
 def _recorded_name(artifact: Artifact) -> str:
