@@ -38,6 +38,9 @@ MAX_OPEN_FILES = 1024
 CLONE_NEWUSER, CLONE_NEWNET = 0x10000000, 0x40000000  # linux/sched.h
 BEYOND = {errno.EFBIG: "what is written of it is too large", errno.EMFILE: "it needs too many open files"}
 NO_MEMORY = -4  # cv2.Error.StsNoMem
+ERRORS: dict[str, type[Exception]] = {
+    kind.__name__: kind for kind in (InputError, PlaceError, OSError, LostWorkerError)
+}
 
 
 def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> None:
@@ -75,13 +78,7 @@ def run_caged(read: Callable[..., object], *arguments: object, folder: Path) -> 
             reader.kill()
             raise
     if error:
-        kinds: dict[str, type[Exception]] = {
-            "InputError": InputError,
-            "PlaceError": PlaceError,
-            "OSError": OSError,
-            "LostWorkerError": LostWorkerError,
-        }
-        raise kinds.get(error["error"], RuntimeError)(*error["arguments"])
+        raise ERRORS.get(error["error"], RuntimeError)(*error["arguments"])
     if reader.returncode > 0:
         raise RuntimeError(f"{opened}: its reader ended with exit code {reader.returncode}")
     if reader.returncode < 0:
