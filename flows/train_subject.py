@@ -77,7 +77,8 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
     capture = path_or_url(capture)
-    source, truth = retried(read_capture)(local_folder(artifact_store, capture), store)
+    folder = capture if isinstance(capture, Path) else fetched(artifact_store, retried(remote_capture)(capture))
+    source, truth = retried(read_capture)(folder, store)
     subject, made = ingested(artifact_store, source, capture, settings)
     recording = made[-1]
     skipped = OPTIONAL - {one.stage for one in made}
@@ -155,13 +156,6 @@ def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     if isinstance(capture, Path):
         with suppress(OSError):
             clear(capture)
-
-
-def local_folder(store: Store, capture: Path | str) -> Path:
-    """Return a capture's folder or video; fetch it if it is in a bucket."""
-    if isinstance(capture, Path):
-        return capture
-    return fetched(store, retried(remote_capture)(capture))
 
 
 def calibrated_held_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:
