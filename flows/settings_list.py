@@ -19,7 +19,8 @@ FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
 def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Iterator[str]:
     """Yield a line for each setting, `key=value  type  description`; settings of nested sections have their section's
     key as prefix. kinds: the available kinds, for a section that can be one of several."""
-    about = {name: text for kind in _sections(type(settings)) for name, text in _comments(kind).items()}
+    bases = [base for base in reversed(type(settings).__mro__) if issubclass(base, Section)]
+    about = {name: text for base in bases for name, text in _comments(base).items()}
     for name, field in type(settings).model_fields.items():
         value = getattr(settings, name)
         if isinstance(value, Section):
@@ -29,11 +30,6 @@ def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Itera
         else:
             assigned = f"{prefix}{name}={json.dumps(value, default=str)}"
             yield f"{assigned:<45}  {kinds if name == 'kind' else _type(field):<20}  {about.get(name, '')}".rstrip()
-
-
-def _sections(kind: type[Section]) -> list[type]:
-    """Return the class and its bases that may have settings, bases first."""
-    return [base for base in reversed(kind.__mro__) if issubclass(base, Section)]
 
 
 @cache  # Python parses a class's whole file to find its source

@@ -6,7 +6,6 @@ from pathlib import Path
 from hnerf.errors import InputError
 
 ROOT = Path(__file__).parents[1]
-FOREVER = "Restart=always\nRestartSec=10"
 
 
 def units(root: Path) -> dict[str, str]:
@@ -31,7 +30,8 @@ After={after}
 [Service]
 WorkingDirectory={folder}
 ExecStart={command}
-{FOREVER}
+Restart=always
+RestartSec=10
 TimeoutStopSec=90
 OOMPolicy=continue
 
