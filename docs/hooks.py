@@ -1,4 +1,5 @@
-"""Show pages that lie outside docs/ on the site, too: README, CONTRIBUTING, CHANGELOG and the committed results."""
+"""Show pages that lie outside docs/ on the site, too: README, CONTRIBUTING, CHANGELOG and the committed results; and
+write the pages of the packages' API."""
 
 import re
 from pathlib import Path
@@ -12,10 +13,15 @@ OUTSIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "benchmark
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the files of OUTSIDE under their paths in the repository."""
+    """Add the files of OUTSIDE under their paths in the repository, and pages of packages without one in docs/api/."""
     for pattern in OUTSIDE:
         for path in sorted(ROOT.glob(pattern)):
             files.append(File.generated(config, path.relative_to(ROOT).as_posix(), abs_src_path=str(path)))
+    for path in sorted((ROOT / "hnerf").glob("*/__init__.py")):
+        package = path.parent.name
+        if f"api/{package}.md" not in files.src_uris:
+            text = f"# `hnerf.{package}`\n\n::: hnerf.{package}\n"
+            files.append(File.generated(config, f"api/{package}.md", content=text))
     return files
 
 

@@ -53,9 +53,8 @@ def test_answers_to_where_is_name_existing_code() -> None:
 
 def test_every_package_has_an_api_page() -> None:
     nav = (ROOT / "mkdocs.yml").read_text()
-    for folder in sorted(path.parent for path in (ROOT / "hnerf").glob("*/__init__.py")):
-        assert f"::: hnerf.{folder.name}\n" in (ROOT / "docs" / "api" / f"{folder.name}.md").read_text()
-        assert f"api/{folder.name}.md" in nav
+    for path in (ROOT / "hnerf").glob("*/__init__.py"):  # docs/hooks.py writes the pages
+        assert f"api/{path.parent.name}.md" in nav
 
 
 def test_the_design_names_every_module_and_package() -> None:
