@@ -154,44 +154,26 @@ def test_a_name_that_is_not_utf_8_or_a_deep_folder_does_not_block_other_captures
     assert sorted(path.name for path in (watched / ".refused").iterdir()) == [os.fsdecode(b"a\xff.txt")]
 
 
-def test_an_unreadable_capture_is_logged_and_the_others_are_started(
+def test_a_refused_capture_is_logged_and_noted_until_it_is_changed_or_removed_and_others_are_started(
     watched: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """The capture itself is not moved."""
+    noted, why = watched / ".refused", "0.jpg: cannot be read; make it readable"
+
     def unreadable(capture: Path) -> Any:
         if capture.name == "ada":
-            raise InputError("0.jpg: cannot be read; make it readable")
+            raise InputError(why)
         return read_capture(capture)
 
     with monkeypatch.context() as broken:
         broken.setattr(module, "read_capture", unreadable)
         assert look(watched) == ["bob"]
-    assert "0.jpg: cannot be read" in caplog.text
+    assert why in caplog.text and (noted / "ada.txt").read_text().startswith(f"ada: refused: {why}\n")
     assert look(watched) == ["ada"]
-
-
-def test_a_refused_capture_is_noted_until_it_is_changed_or_removed(
-    watched: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The captures themselves are not moved."""
-    for name in ("ada", "bob"):
-        (watched / name / "images" / "locked").mkdir()
-    noted = watched / ".refused"
-
-    def refuse(path: Path) -> Any:
-        raise InputError(f"{path / 'images' / 'locked'}: cannot be read; make it readable")
-
-    with monkeypatch.context() as broken:
-        broken.setattr(module, "read_capture", refuse)
-        assert look(watched) == []
-        text = (noted / "ada.txt").read_text()
-        assert text.startswith(
-            f"ada: refused: {watched / 'ada' / 'images' / 'locked'}: cannot be read; make it readable"
-        )
-    assert look(watched) == ["ada", "bob"]
     assert list(noted.iterdir()) == []
     (noted / "gone.txt").touch()
     look(watched)
-    assert list(noted.iterdir()) == [] and (watched / "ada" / "images" / "locked").is_dir()
+    assert list(noted.iterdir()) == [] and (watched / "ada" / "images").is_dir()
 
 
 def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> None:

@@ -270,13 +270,3 @@ def test_detected_hands_stay_linked_when_an_earlier_run_detected_people(
         train_subject.fn(folder, "demo", tmp_path / "store", [])
     linked = artifacts.subject_folder("ada")
     assert {path.name for path in linked.iterdir() if path.is_symlink()} == {"capture", "hands"}
-
-
-def test_another_recording_of_the_same_name_is_logged(
-    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "bare.txt").touch()
-    train_subject.fn(folder, "demo", tmp_path / "store", [])
-    train_subject.fn(tmp_path / "other", "demo", tmp_path / "store", [])
-    assert f"subjects/ada showed the results of {folder} and will show those of {tmp_path}/other" in caplog.text

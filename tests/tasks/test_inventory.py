@@ -78,9 +78,3 @@ def test_the_name_of_a_recording_is_read_only_from_a_regular_file(
     (capture.root / "capture.json").rename(capture.root / "named.json")
     replace(capture.root / "capture.json")
     assert Inventory.of(store).owners[capture.name] == set()
-
-
-def test_the_recording_of_a_subject_is_the_path_it_was_read_from(store: Store) -> None:
-    assert store.recording_folder("ada") == ""
-    store.claim("ada", "0123", Path("/recordings/ada"))
-    assert store.recording_folder("ada") == "/recordings/ada"
