@@ -1,4 +1,3 @@
-import contextvars
 import signal
 import subprocess
 import sys
@@ -27,13 +26,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def within(stage_s: float, work: Callable[[], Any], image_s: float = 0.0) -> Any:
-    """Run work under limits that do not affect later tests; return its result."""
-
-    def both() -> Any:
-        set_limits(LimitSettings(stage_s=stage_s, image_s=image_s))
-        return work()
-
-    return contextvars.copy_context().run(both)
+    """Run work under limits; return its result."""
+    set_limits(LimitSettings(stage_s=stage_s, image_s=image_s))
+    return work()
 
 
 def sleep_in(resumable: bool, with_progress_every_s: float | None = None, duration_s: float = 5.0) -> None:
