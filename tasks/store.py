@@ -36,8 +36,8 @@ from uuid import uuid4
 
 from pydantic import BaseModel, Field, FiniteFloat
 
-from hnerf.errors import DISK_FULL, InputError, PlaceError
-from hnerf.files import atomic_file, made_folder, replace_text
+from hnerf.errors import InputError, PlaceError
+from hnerf.files import atomic_file, made_folder, naming_full_disk, replace_text
 from tasks.pins import pin, unless_read_only
 
 log = logging.getLogger("hnerf.store")
@@ -178,10 +178,9 @@ class Store:
                     path.unlink()
             partial.mkdir(parents=True, exist_ok=True)
             try:
-                metrics = write(partial)
+                with naming_full_disk(self.root):
+                    metrics = write(partial)
             except BaseException as error:
-                if isinstance(error, OSError) and error.errno in DISK_FULL and error.filename is None:
-                    error.filename = str(self.root)
                 if not resumable or (isinstance(error, InputError) and not isinstance(error, PlaceError)):
                     remove(partial)
                 else:
