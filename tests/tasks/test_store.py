@@ -378,21 +378,6 @@ def test_a_subject_links_to_the_latest_artifact(tmp_path: Path) -> None:
     assert list(link.parent.iterdir()) == [link]
 
 
-def test_two_processes_with_one_id_can_link_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in two containers that share a store."""
-
-    def replaced(*ends: Path) -> None:
-        monkeypatch.setattr(os, "replace", replace)
-        store.link_latest("ada", theirs)
-        replace(*ends)
-
-    store, replace = Store(tmp_path), os.replace
-    mine, theirs = (store.get_or_compute("fit", key, write_abc) for key in ("mine", "theirs"))
-    monkeypatch.setattr(os, "replace", replaced)
-    store.link_latest("ada", mine)
-    assert os.readlink(tmp_path / "subjects" / "ada" / "fit") == "../../fit/mine"
-
-
 def test_new_hands_unlink_results_computed_without_them(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("capture", "fit", "asset", "hands"):
