@@ -27,8 +27,8 @@ from provenance import ROOT, arguments, clean_commit, table
 from registry import REGISTRY, Result
 from stopwatch import Stopwatch
 
+from hnerf.processes import end_with_parent
 from hnerf.study.machine import machine
-from tasks.launcher import end_with_parent
 
 FAILED = 1
 POLL_S = 0.2  # interval between checks of running programs
@@ -126,12 +126,13 @@ class Job:
         self.store = new if "{new}" in used else store
         self.log, self.watch = logs / f"{flat}.log", Stopwatch(state, self.digest)
         program, *arguments = (argument.format(store=store, new=new) for argument in result.command)
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(result.threads))
         print(f"{result.name}: under way, {self.log}", flush=True)
         with self.log.open("w") as log:
             self.process = subprocess.Popen(
                 [sys.executable, str(root / "benchmarks" / program), *arguments],
                 cwd=root,
-                env=environment(root, result.threads),
+                env=os.environ | threads | {"PYTHONPATH": str(root)},  # this checkout before installed packages
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 preexec_fn=partial(end_with_parent, signal.SIGTERM, os.getpid()),
@@ -193,13 +194,6 @@ class Job:
     def _written(self) -> list[Path]:
         found = result_files(self.root, self.result)
         return [path for path in found if path.stat().st_mtime_ns != self.before.get(path)]
-
-
-def environment(root: Path, threads: int) -> dict[str, str]:
-    """Return an environment in which this checkout's packages take precedence over installed ones and numeric libraries
-    use this many threads."""
-    counted = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
-    return os.environ | counted | {"PYTHONPATH": str(root)}
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from typing import Any
 from provenance import ROOT, SHARED, arguments, provenance, provenance_line, table, write_result
 
 from hnerf.evaluation.views import NOVEL_POSE_SPLITS
-from tasks.launcher import end_with_parent
+from hnerf.processes import end_with_parent
 
 SCORE_RUN = SHARED / "accept" / "score_run.py"
 CAPTURES = ("valid-walk", "valid-wave", "valid-turn-mono", "pose2sim-balance")
