@@ -46,7 +46,7 @@ SILENCE_S, LOOK_S, POLL_S = 90, 30, 2.0
 BUCKET, CAPTURES = "soak", "s3://soak/captures"
 RESULTS = {"asset": "avatar.usdz", "evaluation": "report.html"}  # a file that each of these stages writes
 MACHINES = 2
-LIMIT_S = 6 * 3600.0
+LIMIT_S, IDLE_S = 6 * 3600.0, 180.0  # for all recordings to be trained, and for the last runs to end
 
 
 def main() -> int:
@@ -54,14 +54,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=6)
     parser.add_argument("--kill-every", type=float, default=120.0, metavar="S")
-    parser.add_argument("--limit", type=float, default=LIMIT_S, metavar="S", help="give up after so long")
     options = parser.parse_args()
-    figures = under_fire(options.subjects, options.kill_every, options.limit)
+    figures = under_fire(options.subjects, options.kill_every)
     print(json.dumps(figures, indent=1))
     return 1 if figures["faults"] else 0
 
 
-def under_fire(subjects: int, kill_every_s: float, limit_s: float = LIMIT_S) -> dict[str, Any]:
+def under_fire(subjects: int, kill_every_s: float) -> dict[str, Any]:
     """Run the soak test in a new folder, which is kept only if there were faults; return the figures."""
     scratch = Path(tempfile.mkdtemp(prefix="hnerf-soak-"))
     mark = uuid4().hex
@@ -82,7 +81,7 @@ def under_fire(subjects: int, kill_every_s: float, limit_s: float = LIMIT_S) -> 
     try:
         with database():
             os.environ[MARK] = mark
-            figures = soak(scratch, (server_port, bucket_port), mark, subjects, kill_every_s, limit_s)
+            figures = soak(scratch, (server_port, bucket_port), mark, subjects, kill_every_s)
     finally:
         for pid in marked(f"{MARK}={mark}"):
             os.kill(pid, signal.SIGKILL)
@@ -93,9 +92,7 @@ def under_fire(subjects: int, kill_every_s: float, limit_s: float = LIMIT_S) -> 
     return figures
 
 
-def soak(
-    scratch: Path, ports: tuple[int, int], mark: str, subjects: int, kill_every_s: float, limit_s: float
-) -> dict[str, Any]:
+def soak(scratch: Path, ports: tuple[int, int], mark: str, subjects: int, kill_every_s: float) -> dict[str, Any]:
     """Train all recordings in a folder, with a server and a bucket at these ports; return the figures, including the
     faults."""
     server_port, bucket_port = ports
@@ -113,7 +110,7 @@ def soak(
         machines = [Machine.started(scratch, number) for number in range(MACHINES)]
         started_s, memory_kib = time.monotonic(), [resident_kib(server.pid)]
         kill_s = started_s + kill_every_s
-        while len(done) < len(names) and time.monotonic() - started_s < limit_s:
+        while len(done) < len(names) and time.monotonic() - started_s < LIMIT_S:
             time.sleep(POLL_S)
             note_finished(scratch, names, done)
             restarted = [machine.restarted() for machine in machines]
@@ -229,9 +226,9 @@ def shared_artifacts(scratch: Path) -> Counter[str]:
     return Counter(re.findall(rf'"PUT /{BUCKET}/shared/(\S+)\.tar HTTP/[0-9.]+" 200', log))
 
 
-def wait_until_idle(patience_s: float = 180.0) -> None:
+def wait_until_idle() -> None:
     """Wait until no run is running; call this once all results exist."""
-    deadline_s = time.monotonic() + patience_s
+    deadline_s = time.monotonic() + IDLE_S
     while time.monotonic() < deadline_s and run_states().get("RUNNING", 0):
         time.sleep(POLL_S)
 
