@@ -70,14 +70,14 @@ class Ledger:
 def forget(store: Path, capture: Path | str) -> None:
     """Release the capture that was started from a folder or URL where it no longer is, so that the next look starts it
     from where it is now."""
-    for record, _ in _started_from(store, capture):
+    for record, _ in started_from(store, capture):
         _forget(record)
 
 
 def release(store: Path, capture: Path | str, failed_run: str) -> None:
     """Release the capture that a run was started for, which failed through no fault of the capture, so that the next
     look starts it again, at most RELEASES times."""
-    for record, run in _started_from(store, capture):
+    for record, run in started_from(store, capture):
         failed = record.with_name(f"{record.name}{FAILED}")
         runs = failed.read_text(errors="replace").splitlines() if failed.exists() else []
         if run == failed_run and len(runs) < RELEASES:
@@ -85,12 +85,7 @@ def release(store: Path, capture: Path | str, failed_run: str) -> None:
             replace_text(failed, "\n".join([*runs, run, ""]))
 
 
-def was_started(store: Path, capture: Path) -> bool:
-    """Return whether this folder's run was started from the watched folder."""
-    return bool(_started_from(store, capture))
-
-
-def _started_from(store: Path, capture: Path | str) -> list[tuple[Path, str]]:
+def started_from(store: Path, capture: Path | str) -> list[tuple[Path, str]]:
     """Return the records of what was started from a folder or URL, and the flow runs in them."""
     started = capture if isinstance(capture, str) else str(capture.absolute())
     records = [(record, record.read_text(errors="replace")) for record in (store / "ingested").glob("[0-9a-f]" * 64)]

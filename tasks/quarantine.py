@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hnerf.errors import printable
 from hnerf.files import replace_text
-from tasks.ledger import RELEASES, was_started
+from tasks.ledger import RELEASES, started_from
 
 FOLDER = ".refused"
 REMEDY = (
@@ -35,7 +35,7 @@ def note(capture: Path, why: str, remedy: str = REMEDY) -> None:
 def note_run(capture: Path | str, store: Path, why: str, remedy: str = f"{REMEDY} {REPEAT}") -> None:
     """Write why a run gave no result, and what to do, if its capture was started from a watched folder (not one in a
     bucket)."""
-    if isinstance(capture, Path) and was_started(store, capture):
+    if isinstance(capture, Path) and started_from(store, capture):
         with suppress(OSError):  # a folder that is read-only, or gone
             note(capture, why, remedy)
 

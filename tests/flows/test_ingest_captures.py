@@ -49,7 +49,7 @@ def every_run_is_the_one_that_was_started(monkeypatch: pytest.MonkeyPatch) -> No
     """Let the ledger take runs that tests start by hand for those of the fake server."""
 
     def release(store: Path, capture: Path | str, _: str) -> None:
-        for _, run in ledger._started_from(store, capture):
+        for _, run in ledger.started_from(store, capture):
             ledger.release(store, capture, run)
 
     monkeypatch.setattr("flows.train_subject.release", release)
@@ -387,7 +387,7 @@ def test_captures_in_a_bucket_are_started_by_their_url(bucket: str, tmp_path: Pa
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada"]
 
 
-def test_a_capture_moved_within_the_bucket_is_started_from_its_new_url(bucket: str, tmp_path: Path) -> None:
+def test_a_capture_moved_within_the_bucket_isstarted_from_its_new_url(bucket: str, tmp_path: Path) -> None:
     store = tmp_path / "store"
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
     filesystem("s3").mv(f"{bucket}/ada/a.mp4", f"{bucket}/adele/a.mp4")

@@ -5,7 +5,7 @@ from unittest.mock import Mock
 import pytest
 
 from hnerf.files import now_s
-from tasks.ledger import Ledger, forget, release, was_started
+from tasks.ledger import Ledger, forget, release, started_from
 
 DIGEST, OTHER = "a" * 64, "b" * 64
 
@@ -86,6 +86,6 @@ def test_damaged_notes_are_ignored(tmp_path: Path) -> None:
     ledger = Ledger.of(tmp_path)
     for name in (DIGEST, "seen-ada"):
         (ledger.root / name).write_bytes(b"\xff\xfe")
-    assert not ledger.seen("seen-ada") and not was_started(tmp_path, tmp_path / "ada")
+    assert not ledger.seen("seen-ada") and not started_from(tmp_path, tmp_path / "ada")
     forget(tmp_path, tmp_path / "ada")
     assert ledger.knows(DIGEST)
