@@ -87,9 +87,7 @@ def ingest_captures(
             run = run_deployment(DEPLOYMENT, parameters=parameters, timeout=0, as_subflow=False, idempotency_key=key)
             ledger.note_started(digest, capture, run.id)  # type: ignore[union-attr]
             log.info("started %s for %s", DEPLOYMENT, capture)
-            if isinstance(capture, Path):
-                with suppress(OSError):
-                    quarantine.clear(capture)
+            quarantine.clear(capture)
             started.append(Path(capture).name)
         ledger.note_seen(listing, digest)
     return started

@@ -152,10 +152,7 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
 @train_subject.on_completion
 def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Remove the note of an earlier run."""
-    capture = path_or_url(flow_run.parameters["capture"])
-    if isinstance(capture, Path):
-        with suppress(OSError):
-            clear(capture)
+    clear(path_or_url(flow_run.parameters["capture"]))
 
 
 def calibrated_held_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:

@@ -40,9 +40,11 @@ def note_run(capture: Path | str, store: Path, why: str, remedy: str = f"{REMEDY
             note(capture, why, remedy)
 
 
-def clear(capture: Path) -> None:
-    """Remove the note about a capture."""
-    _path(capture).unlink(missing_ok=True)
+def clear(capture: Path | str) -> None:
+    """Remove the note about a capture, if it is in a folder that can be written."""
+    if isinstance(capture, Path):
+        with suppress(OSError):
+            _path(capture).unlink(missing_ok=True)
 
 
 def clear_removed(folder: Path) -> None:
