@@ -12,7 +12,7 @@ from hnerf.errors import InputError
 from hnerf.files import atomic_file, made_folder
 from tasks.inventory import Inventory
 from tasks.packed import Contents, Name, archived, pack, place, read_contents, require_room, unpack
-from tasks.store import OPTIONAL, STAGES, Artifact, Store
+from tasks.store import OPTIONAL, STAGES, Store
 
 
 class Manifest(Contents):
@@ -42,7 +42,7 @@ def export_subject(store: Store, subject: str, out: Path) -> Manifest:
     latest = inventory.latest.get(subject, {})
     if not latest:
         raise InputError(f"{store.subject_folder(subject)}: no results; `hnerf store list` names the subjects")
-    artifacts = [_intact(store, *name.split("/")) for name in sorted(_needed(inventory, latest.values()))]
+    artifacts = [store.intact(*name.split("/")) for name in sorted(_needed(inventory, latest.values()))]
     described = {"subject": subject, "recording": store.recording(subject), "latest": latest}
     manifest = validated(Manifest, {**described, "artifacts": archived(artifacts)}, store.subject_folder(subject))
     with made_folder(out.parent), atomic_file(out) as beside:
@@ -73,7 +73,7 @@ def import_subject(store: Store, path: Path) -> Manifest:
             store.claim(manifest.subject, digest, folder)
         store.unlink_latest(manifest.subject, OPTIONAL - manifest.latest.keys())
         for stage in sorted(manifest.latest, key=STAGES.index):
-            store.link_latest(manifest.subject, _intact(store, *manifest.latest[stage].split("/")))
+            store.link_latest(manifest.subject, store.intact(*manifest.latest[stage].split("/")))
     return manifest
 
 
@@ -85,13 +85,6 @@ def _needed(inventory: Inventory, latest: Collection[str]) -> set[str]:
     paths = {name: inventory.store.path(*name.split("/")) for name in inputs - stored}
     left = {name for name, path in paths.items() if path.exists() or path.with_suffix(".json").exists()}
     return {*latest, *stored, *left}
-
-
-def _intact(store: Store, stage: str, key: str) -> Artifact:
-    found = store.find(stage, key)
-    if found is None:
-        raise InputError(f"{store.path(stage, key)}: damaged; repeat the same `hnerf run`, which computes it again")
-    return found
 
 
 def _check_subject(manifest: Manifest, store: Store) -> None:

@@ -131,6 +131,13 @@ class Store:
         log.warning("%s is damaged or missing: %s will be computed again", damaged, stage)
         return None
 
+    def intact(self, stage: str, key: str) -> Artifact:
+        """Return the artifact; raise InputError if it is damaged or missing."""
+        found = self.find(stage, key)
+        if found is None:
+            raise InputError(f"{self.path(stage, key)}: damaged; repeat the same `hnerf run`, which computes it again")
+        return found
+
     def recorded(self, stage: str, key: str) -> Artifact | None:
         """Return the artifact as its record describes it, without a check of its files. Return None if the record
         cannot be read as one, is a link, or is too large. Raises FileNotFoundError if there is no record."""
@@ -349,9 +356,8 @@ def require_intact(subject: Path) -> None:
     """Raise InputError if an artifact to which `<store>/subjects/<name>` links has changed since it was recorded."""
     for link in sorted(subject.iterdir()):
         root = link.resolve()
-        recorded = link.name in STAGES and root.with_name(f"{root.name}.json").is_file()
-        if recorded and Store(root.parents[1]).find(link.name, root.name) is None:
-            raise InputError(f"{root}: damaged; repeat the same `hnerf run`, which computes it again")
+        if link.name in STAGES and root.with_name(f"{root.name}.json").is_file():
+            Store(root.parents[1]).intact(link.name, root.name)
 
 
 def recording_digest(subject: Path) -> str:
