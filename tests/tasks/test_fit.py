@@ -1,6 +1,7 @@
 """The fit stage, with a fake fit."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,18 +13,9 @@ from tasks import stage
 from tasks.store import Artifact, Store
 
 
-class Body:
-    """A fake body that is saved as one file."""
-
-    def save(self, out: Path) -> None:
-        (out / "body.npz").write_bytes(b"body")
-
-
-class Face(Body):
-    """A fake body whose face was fitted."""
-
-    def save(self, out: Path) -> None:
-        (out / "face.npz").write_bytes(b"face")
+def saved_as(name: str) -> SimpleNamespace:
+    """Return a fake body that is saved as one file."""
+    return SimpleNamespace(save=lambda out: (out / name).write_bytes(b"fitted"))
 
 
 def report(seconds: float = 1.0) -> FitReport:
@@ -36,7 +28,7 @@ def test_the_digest_of_a_fit_does_not_depend_on_its_duration(tmp_path: Path, mon
     given = Artifact(stage="capture", root=tmp_path, files={})
 
     def made(store: str, seconds: float) -> Artifact:
-        monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report(seconds)))
+        monkeypatch.setattr(module, "fit_body", lambda *_: (saved_as("body.npz"), report(seconds)))
         return module.fit(Store(tmp_path / store), given, given, None, FitSettings())
 
     quick, slow = made("a", 1.0), made("b", 2.0)
@@ -56,8 +48,8 @@ def test_a_face_is_fitted_with_masks_and_the_network(
     given = Artifact(stage="capture", root=tmp_path / ("0" * 32), files={})
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: None)
     monkeypatch.setattr(module.Masks, "load", lambda _: "masks")
-    monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report()))
-    monkeypatch.setattr(module, "fit_face", lambda _, body: Face())
+    monkeypatch.setattr(module, "fit_body", lambda *_: (saved_as("body.npz"), report()))
+    monkeypatch.setattr(module, "fit_face", lambda _, body: saved_as("face.npz"))
     store = Store(tmp_path / "store")
     caplog.set_level("INFO")
     for there in (not installed, installed):
