@@ -65,4 +65,4 @@ class Checkout:
 
 def made(name: str, program: str = "program.py", **more: object) -> Result:
     """Return a result NAME.md of a program that is given the name and the store."""
-    return Result(name, (program, name, "{store}"), (f"{name}.md",), **more)  # type: ignore[arg-type]
+    return Result(name, (program, name, "{store}"), (f"{name}.md",), **more)

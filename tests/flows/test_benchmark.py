@@ -112,8 +112,7 @@ def true_mask(folder: Path) -> Path:
 
 
 def read(table: Path) -> dict[str, Any]:
-    result: dict[str, Any] = json.loads(table.with_suffix(".json").read_text())
-    return result
+    return json.loads(table.with_suffix(".json").read_text())
 
 
 @pytest.mark.usefixtures("without_charts")

@@ -81,7 +81,7 @@ def test_every_parameter_of_every_deployment_has_a_description(deployed: str) ->
         assert deployment.parameter_openapi_schema["properties"]["store"]["minLength"] == 1
         for name, parameter in deployment.parameter_openapi_schema["properties"].items():
             assert parameter.get("description"), f"{deployment.entrypoint}: {name}"
-    watch = found["flows/ingest_captures.py:ingest_captures"].parameter_openapi_schema["properties"]  # type: ignore[index]
+    watch = found["flows/ingest_captures.py:ingest_captures"].parameter_openapi_schema["properties"]
     assert (watch["max_unfinished"]["minimum"], watch["max_unfinished"]["maximum"]) == (1, 1000)
 
 
@@ -106,14 +106,14 @@ def test_a_crashed_run_is_restarted_a_few_times_and_then_fails(deployed: str, mo
     run = run_deployment("train-subject/local", parameters={"capture": "/recordings/bob"}, timeout=0)
     with get_client(sync_client=True) as client:
         for _ in range(2):
-            client.set_flow_run_state(run.id, Crashed(), force=True)  # type: ignore[union-attr]
+            client.set_flow_run_state(run.id, Crashed(), force=True)
             assert restart_crashed(max_restarts=2) == []
-            begins = client.read_flow_run(run.id).next_scheduled_start_time  # type: ignore[union-attr]
+            begins = client.read_flow_run(run.id).next_scheduled_start_time
             assert begins and begins > datetime.now(UTC) + RELEASE / 2
-        client.set_flow_run_state(run.id, Crashed(), force=True)  # type: ignore[union-attr]
+        client.set_flow_run_state(run.id, Crashed(), force=True)
         ((lost, why),) = restart_crashed(max_restarts=2)
-        state = client.read_flow_run(run.id).state  # type: ignore[union-attr]
-        assert lost.id == run.id and state and (state.name, state.message) == ("Failed", why)  # type: ignore[union-attr]
+        state = client.read_flow_run(run.id).state
+        assert lost.id == run.id and state and (state.name, state.message) == ("Failed", why)
         assert why.startswith("its process or machine was lost 3 times")
         assert restart_crashed(max_restarts=2) == []
 
@@ -121,7 +121,7 @@ def test_a_crashed_run_is_restarted_a_few_times_and_then_fails(deployed: str, mo
 def test_a_run_that_may_live_is_not_started_a_second_time(deployed: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A server that was away ends all runs when it returns, before their heartbeats reach it. Such a run can still
     complete."""
-    run = run_deployment("train-subject/local", parameters={"capture": "/recordings/eve"}, timeout=0).id  # type: ignore[union-attr]
+    run = run_deployment("train-subject/local", parameters={"capture": "/recordings/eve"}, timeout=0).id
     with get_client(sync_client=True) as client:
         client.set_flow_run_state(run, Crashed(), force=True)
         crashed = client.read_flow_run(run)
@@ -147,9 +147,9 @@ def test_runs_beyond_one_page_of_the_server_are_counted(deployed: str, monkeypat
     assert unfinished_runs() == before + 5
     with get_client(sync_client=True) as client:
         for run in begun:
-            client.set_flow_run_state(run.id, Crashed(), force=True)  # type: ignore[union-attr]
+            client.set_flow_run_state(run.id, Crashed(), force=True)
         crashed = [run.id for run in restart._all_runs(client, StateType.CRASHED)]
-    assert {run.id for run in begun} <= set(crashed) and len(crashed) == len(set(crashed))  # type: ignore[union-attr]
+    assert {run.id for run in begun} <= set(crashed) and len(crashed) == len(set(crashed))
 
 
 @pytest.mark.parametrize("pool", ["docker", "kubernetes"])

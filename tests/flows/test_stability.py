@@ -139,7 +139,7 @@ def study(tmp_path: Path, **options: Any) -> dict[str, Any]:
     table = stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", **options)
     part = "-part" if options else ""
     assert table == tmp_path / "store" / "stability" / f"ada-mine{part}.md"
-    return dict(json.loads(table.with_suffix(".json").read_text()))
+    return json.loads(table.with_suffix(".json").read_text())
 
 
 @pytest.mark.usefixtures("true_charts")

@@ -77,7 +77,7 @@ def replace_stages(patch: pytest.MonkeyPatch, names: Iterable[str], write: Calla
         for name in set(names) & set(vars(place)):
             stage = getattr(place, name)
             fake = partial(write, stage.name)
-            fake.__signature__ = inspect.signature(stage.write)  # type: ignore[attr-defined]
+            fake.__signature__ = inspect.signature(stage.write)
             patch.setattr(place, name, Stage(fake, stage.name, "test"))
 
 

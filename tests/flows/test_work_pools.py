@@ -22,7 +22,7 @@ NOT_OURS = {"parallelism", "completions"}  # Prefect requires these in the pod s
 
 
 def template(pool: str) -> dict[str, Any]:
-    return json.loads((POOLS / f"{pool}.json").read_text())  # type: ignore[no-any-return]
+    return json.loads((POOLS / f"{pool}.json").read_text())
 
 
 def worker_of(pool: str) -> type[BaseWorker]:
@@ -110,7 +110,7 @@ def test_variables_reach_the_job() -> None:
 def docker_settings(**values: object) -> dict[str, Any]:
     """Return the container settings that the worker sends to Docker."""
     job = prepared("docker", env={"PREFECT_API_URL": "https://example.org/api"}, **values)
-    return worker_of("docker")._build_container_settings(None, None, job)  # type: ignore[no-any-return]
+    return worker_of("docker")._build_container_settings(None, None, job)
 
 
 def test_docker_containers_get_a_gpu_limits_and_the_folders_of_the_checkout(

@@ -165,7 +165,7 @@ def repack(path: Path, members: list[tuple[str, bytes]], **changes: Any) -> None
 
 def unpacked(path: Path) -> list[tuple[str, bytes]]:
     with tarfile.open(path) as archive:
-        return [(member.name, archive.extractfile(member).read()) for member in archive]  # type: ignore[union-attr]
+        return [(member.name, archive.extractfile(member).read()) for member in archive]
 
 
 def change_manifest(path: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -159,7 +159,7 @@ def test_a_reader_that_exceeds_a_limit_is_refused_with_the_name_of_the_file(
 ) -> None:
     set_limits(LimitSettings(stage_s=0.2, image_s=0, reader_gib=1))
     with pytest.raises(InputError, match=f"^{tmp_path}.*{why}$"):
-        run_caged(read, with_first_file(tmp_path), folder=tmp_path)  # type: ignore[arg-type]
+        run_caged(read, with_first_file(tmp_path), folder=tmp_path)
 
 
 def test_a_reader_that_makes_progress_gets_more_time(tmp_path: Path) -> None:

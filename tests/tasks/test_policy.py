@@ -159,4 +159,4 @@ def test_key_equals_a_known_value() -> None:
     ],
 )
 def test_only_transient_faults_are_retried(error: Exception, transient: bool) -> None:
-    assert is_transient(None, None, Failed(data=error)) is transient  # type: ignore[arg-type]
+    assert is_transient(None, None, Failed(data=error)) is transient

@@ -258,7 +258,7 @@ def test_each_new_checkpoint_is_uploaded_once_during_the_work(
         for text in ("step 100", "step 200"):
             (out / "beside").write_text(text)
             os.replace(out / "beside", out / "checkpoint")
-            wait_until(lambda text=text: bucket.read_note(CHECKPOINT) == text.encode())  # type: ignore[misc]
+            wait_until(lambda text=text: bucket.read_note(CHECKPOINT) == text.encode())
             time.sleep(0.05)
         return finish(out)
 
@@ -392,7 +392,7 @@ def test_a_worker_killed_at_a_random_moment_loses_nothing(tmp_path: Path) -> Non
     while not (tmp_path / "bucket" / "fit").exists() and time.monotonic() < deadline_s:
         time.sleep(0.01)
     time.sleep(random.uniform(0, 0.4))
-    os.kill(victim.pid or 0, signal.SIGKILL)
+    os.kill(victim.pid, signal.SIGKILL)
     victim.join()
     rescuer = SPAWN.Process(target=work_in, args=(tmp_path, "there", 0.6))
     rescuer.start()

@@ -235,7 +235,7 @@ def test_a_refusal_is_logged_without_a_traceback(
 ) -> None:
     lines: list[str] = []
     handler = logging.Handler()
-    handler.emit = lambda record: lines.append(logging.Formatter().format(record))  # type: ignore[method-assign]
+    handler.emit = lambda record: lines.append(logging.Formatter().format(record))
     (source.root / "text").write_text("bad")
     loggers = [logging.getLogger(name) for name in LOGGERS]
     for logger in loggers:

@@ -14,7 +14,7 @@ def test_the_checkpoint_is_kept_until_training_ends_and_is_not_in_the_artifact(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def ranks(*arguments: object) -> None:
-        out = Path(arguments[1][-1])  # type: ignore[index]
+        out = Path(arguments[1][-1])
         found.append(sorted(path.name for path in out.iterdir()))
         for name in ("checkpoint.pt", "checkpoint.pt.tmp"):
             (out / name).write_bytes(b"state")
