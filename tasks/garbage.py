@@ -9,8 +9,9 @@ process finds no record, or its use is noticed here.
 import fcntl
 import os
 import re
+import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,22 +128,17 @@ def _left_behind(inventory: Inventory) -> Iterator[Garbage]:
             continue
         recorded = inventory.store.path(stage, key, ".json").exists()
         if not (recorded and all(path.suffix == ".lock" for path in paths)):
-            files = [file for path in paths for file in [path, *path.rglob("*")]]
-            yield Garbage(stage, key, tuple(paths), _size_bytes(files), _written_s(tuple(paths)))
+            size_bytes = sum(found.st_size for found in _stats(paths) if stat.S_ISREG(found.st_mode))
+            yield Garbage(stage, key, tuple(paths), size_bytes, _written_s(paths))
 
 
-def _written_s(paths: tuple[Path, ...]) -> float:
+def _written_s(paths: Iterable[Path]) -> float:
     """Return when any of these files, or a file in these folders, was last written; 0 if none is left."""
-    times = [0.0]
-    for path in [file for one in paths if one.suffix != ".lock" for file in [one, *one.rglob("*")]]:
-        with suppress(FileNotFoundError):
-            times.append(path.lstat().st_mtime)
-    return max(times)
+    return max((found.st_mtime for found in _stats(paths)), default=0.0)
 
 
-def _size_bytes(paths: list[Path]) -> int:
-    total = 0
-    for path in paths:
+def _stats(paths: Iterable[Path]) -> Iterator[os.stat_result]:
+    """Yield the state of these files and folders, and of all in them, that still exist; without locks."""
+    for one in [inner for path in paths if path.suffix != ".lock" for inner in [path, *path.rglob("*")]]:
         with suppress(FileNotFoundError):
-            total += path.lstat().st_size if path.is_file() and not path.is_symlink() else 0
-    return total
+            yield one.lstat()
