@@ -61,15 +61,6 @@ def test_studies_show_their_progress(study: Flow[..., Path], tmp_path: Path, mon
     shown.assert_called_once_with(Progress("ingestion", 1, 2))
 
 
-def test_an_unreachable_server_does_not_end_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    create = Mock(side_effect=ConnectionError("no server"))
-    monkeypatch.setattr(run_page, "create_progress_artifact", create)
-    page = run_page._ProgressPage()
-    page.next_s["fit"] = 0.0
-    page.show(run_page.Progress("fit", 1, 2))
-    create.assert_called_once()
-
-
 def test_a_run_whose_page_cannot_be_written_has_not_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

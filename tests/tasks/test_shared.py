@@ -78,13 +78,6 @@ def test_one_machine_uses_the_artifact_of_another(bucket: Bucket, tmp_path: Path
     assert made(bucket, here, never) == first
 
 
-def test_an_artifact_of_the_local_store_is_shared_on_use(bucket: Bucket, tmp_path: Path) -> None:
-    store = Store(tmp_path / "here")
-    store.get_or_compute("fit", KEY, write)
-    made(bucket, store, never)
-    made(bucket, Store(tmp_path / "there"), never)
-
-
 def damage(bucket: Bucket, change: Callable[[bytes], bytes]) -> None:
     path = f"{bucket.root}/{OBJECT}"
     bucket.fs.pipe_file(path, change(bucket.fs.cat_file(path)))

@@ -180,11 +180,6 @@ def test_a_store_in_the_capture_is_bad_input(folder: Path) -> None:
         read_capture(folder, folder / "store")
 
 
-def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such folder"):
-        read_capture(tmp_path / "absent")
-
-
 def test_a_local_place_is_a_path_and_a_remote_one_a_url() -> None:
     given = ("s3://b/ada", "file:///ada", "ada", Path("ada"))
     assert [path_or_url(one) for one in given] == ["s3://b/ada", Path("/ada"), Path("ada"), Path("ada")]
