@@ -7,7 +7,8 @@ points in order, which caches better). Writes `benchmarks/results/descriptor.jso
 a warm-up run.
 """
 
-import time
+import statistics
+import timeit
 from collections.abc import Callable
 from typing import Any
 
@@ -65,12 +66,7 @@ def shell_points(vertices_m: Tensor, faces: Tensor) -> Tensor:
 
 def median_s(work: Callable[[], Any]) -> float:
     """Return the median time of one call, in seconds."""
-    seconds = []
-    for _ in range(RUNS + 1):
-        started = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - started)
-    return sorted(seconds[1:])[RUNS // 2]
+    return statistics.median(timeit.repeat(work, number=1, repeat=RUNS + 1)[1:])
 
 
 if __name__ == "__main__":
