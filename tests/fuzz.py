@@ -139,10 +139,6 @@ def _zju(folder: Path) -> None:
     write_parameters(folder / "new_params" / "0.npy", np.zeros(72))
 
 
-def _peoplesnapshot(folder: Path) -> None:
-    write_peoplesnapshot(folder, FRAMES, (32, 32))
-
-
 def _videos(folder: Path) -> None:
     rec.write_video(folder / "ada.mp4", FRAMES, (32, 32))
     text = 'field_of_view_deg = 60.0\nsubject = "nearest to (10, 20) in ada at frame 1"\nfps = 25\n'
@@ -152,10 +148,6 @@ def _videos(folder: Path) -> None:
 def _uncalibrated(folder: Path) -> None:
     _easymocap(folder)
     (folder / "extri.yml").unlink()
-
-
-def _read_uncalibrated(folder: Path, out: Path) -> object:
-    return ingest(folder, CaptureSettings(), out, Uncalibrated(folder))
 
 
 def _motion(folder: Path) -> None:
@@ -190,9 +182,9 @@ READERS = (
     Reader("caliscope", _boards, _ingest),
     Reader("aniposelib", _with_cameras("aniposelib"), _ingest),
     Reader("zju-mocap", _zju, _ingest),
-    Reader("peoplesnapshot", _peoplesnapshot, _ingest),
+    Reader("peoplesnapshot", lambda folder: write_peoplesnapshot(folder, FRAMES, (32, 32)), _ingest),
     Reader("videos", _videos, _ingest),
-    Reader("uncalibrated", _uncalibrated, _read_uncalibrated),
+    Reader("uncalibrated", _uncalibrated, lambda at, out: ingest(at, CaptureSettings(), out, Uncalibrated(at))),
     Reader("motion", _motion, lambda folder, out: _read_amass(folder / "a.npz")),
     Reader("bvh", _bvh, lambda folder, out: read_bvh(folder / "a.bvh")),
     Reader("camera path", _camera_path, lambda folder, out: read_camera_path(folder / "path.json", (24, 16))),
