@@ -72,10 +72,10 @@ def evaluate_held_out(
 
 def _headline(found: Mapping[Any, Any]) -> dict[str, float]:
     """Return the mean image scores of each split that has any."""
-    means = {
-        f"{split} {name}": found[split][name]
+    return {
+        f"{split} {name}": value
         for split in SPLITS
         if split in found
         for name in ("psnr", "ssim", "lpips")
+        if (value := found[split][name]) is not None
     }
-    return {name: value for name, value in means.items() if value is not None}
