@@ -107,10 +107,11 @@ def as_markdown(result: dict[str, Any]) -> str:
     ]
     for split, title in (("novel_view", "Training poses, test cameras"), ("novel_pose", "New poses, animated")):
         lines += ["", f"## {title}", "", *_split_table(result["captures"], split)]
-    lines += ["", "## New poses in three columns, by the evaluation itself", "", *_columns_table(result["captures"])]
-    lines += ["", "## Cameras left out, by the evaluation itself", "", *_holdout_table(result["captures"])]
-    lines += ["", "## Cost and body fit", "", *_cost_table(result["captures"])]
-    protocols = {c["own_metrics"]["protocol"] for c in result["captures"].values() if "own_metrics" in c}
+    finished = {name: figures for name, figures in result["captures"].items() if "error" not in figures}
+    lines += ["", "## New poses in three columns, by the evaluation itself", "", *_columns_table(finished)]
+    lines += ["", "## Cameras left out, by the evaluation itself", "", *_holdout_table(finished)]
+    lines += ["", "## Cost and body fit", "", *_cost_table(finished)]
+    protocols = {figures["own_metrics"]["protocol"] for figures in finished.values()}
     note = "The independent program samples 30 000 points a surface and counts volumes on an 80^3 grid."
     return "\n".join([*lines, "", "## Protocol", "", *protocols, "", note, ""])
 
@@ -139,9 +140,7 @@ def _columns_table(captures: dict[str, Any]) -> list[str]:
     none."""
     rows = [["capture", "animated", "posed", "tracked"]]
     for name, figures in captures.items():
-        if "error" not in figures:
-            own = figures["own_metrics"]
-            rows.append([name, *(_image_cell(own[column]) for column in NOVEL_POSE_SPLITS)])
+        rows.append([name, *(_image_cell(figures["own_metrics"][column]) for column in NOVEL_POSE_SPLITS)])
     return table(rows)
 
 
@@ -150,8 +149,6 @@ def _holdout_table(captures: dict[str, Any]) -> list[str]:
     none."""
     rows = [["capture", "camera left out", "training poses", "new poses, animated"]]
     for name, figures in captures.items():
-        if "error" in figures:
-            continue
         held_out = figures["own_metrics"]["holdout"]
         if held_out is None:
             rows.append([name, "", figures["own_metrics"]["holdout_reason"]])
@@ -171,14 +168,13 @@ def _cost_table(captures: dict[str, Any]) -> list[str]:
     costs = ["setup, s", "training, s", "of that the field, s", "device", "one image, s", "whole run, s"]
     rows = [["capture", "limb joints, mm", *costs]]
     for name, figures in captures.items():
-        if "error" not in figures:
-            fit = (figures["score"] or {}).get("fit")
-            joints = "" if fit is None else f"{fit['limb_joint_error_mm']:.1f}"
-            image = f"{figures['own_metrics']['seconds_per_image']:.2f}"
-            run = "" if figures["run_seconds"] is None else f"{figures['run_seconds']:.0f}"
-            training = figures["training"]
-            seconds = [f"{training[key]:.0f}" for key in ("setup_seconds", "seconds", "field_seconds")]
-            rows.append([name, joints, *seconds, training["device"], image, run])
+        fit = (figures["score"] or {}).get("fit")
+        joints = "" if fit is None else f"{fit['limb_joint_error_mm']:.1f}"
+        image = f"{figures['own_metrics']['seconds_per_image']:.2f}"
+        run = "" if figures["run_seconds"] is None else f"{figures['run_seconds']:.0f}"
+        training = figures["training"]
+        seconds = [f"{training[key]:.0f}" for key in ("setup_seconds", "seconds", "field_seconds")]
+        rows.append([name, joints, *seconds, training["device"], image, run])
     return table(rows)
 
 
