@@ -108,9 +108,12 @@ def _has_room(store: Path, min_free_gib: float) -> bool:
 
 def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tuple[Path | str, str]]:
     """Yield the captures of a folder that are complete and were not seen before, with the digests of their listings.
-    For a capture that cannot be read, note why."""
+    For a capture that cannot be read, note why (not in a bucket)."""
     if isinstance(folder, str):
-        yield from _unseen_in_bucket(folder, ledger, settle_s)
+        for remote in remote_captures(folder):
+            listing = f"seen-{remote.digest}"
+            if not ledger.seen(listing) and ledger.stood_s(listing) >= settle_s:
+                yield remote.url, listing
         return
     for capture in _captures(folder.absolute()):  # elsewhere, a link may lead to another place
         try:
@@ -121,14 +124,6 @@ def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tup
             log.error("%s", error)
         except (InputError, OSError) as error:
             _refuse(capture, error)
-
-
-def _unseen_in_bucket(folder: str, ledger: Ledger, settle_s: float) -> Iterator[tuple[str, str]]:
-    """Yield the complete and unseen captures in a bucket, with the digests of their listings."""
-    for capture in remote_captures(folder):
-        listing = f"seen-{capture.digest}"
-        if not ledger.seen(listing) and ledger.stood_s(listing) >= settle_s:
-            yield capture.url, listing
 
 
 def _digest(capture: Path | str, listing: str) -> str | None:
