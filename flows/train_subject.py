@@ -26,9 +26,8 @@ from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.ledger import forget, release
 from tasks.limits import StalledError, set_limits
-from tasks.policy import is_of_the_machine
+from tasks.policy import EXPECTED, is_of_the_machine
 from tasks.quarantine import MACHINE, clear, note_run
-from tasks.quiet import EXPECTED
 from tasks.remote import fetched, remote_capture
 from tasks.source import GoneError, Source, path_or_url, read_capture
 from tasks.stage import retried

@@ -1,8 +1,10 @@
-"""Cache and retry policy: when a stage's result can be reused, and when a failed stage is retried."""
+"""Cache and retry policy: when a stage's result can be reused, when a failed stage is retried, and which errors are
+logged in one line instead of one traceback for the task and another for the flow."""
 
 import errno
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Iterable
 from contextlib import suppress
@@ -16,15 +18,17 @@ from prefect.settings import PREFECT_RESULTS_LOCAL_STORAGE_PATH
 from prefect.tasks import Task
 
 from hnerf.config import Section
-from hnerf.errors import PlaceError, is_out_of_memory
-from tasks.bucket import VARIABLE
-from tasks.launcher import LostWorkerError
+from hnerf.errors import InputError, InvalidAsset, PlaceError, is_out_of_memory
+from tasks.bucket import VARIABLE, BucketError
+from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
 from tasks.source import Source
 from tasks.store import Artifact, Store, sha256_of
 
 PERMANENT_ERRORS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 PERMANENT_ERRNOS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTEMPTY)  # without an exception class
+EXPECTED = (InputError, InvalidAsset, BucketError, LostWorkerError, RankFailedError, StalledError)
+LOGGERS = ("prefect.task_runs", "prefect.flow_runs", "prefect.engine", "prefect.flow_engine")
 
 Input = Artifact | Source | Section | str | tuple[str, ...] | tuple[int, ...] | tuple[Artifact, ...] | None
 
@@ -116,3 +120,15 @@ def is_of_the_machine(error: Exception) -> bool:
 def is_permanent(error: Exception) -> bool:
     """Return whether input or output failed because of the path itself, so that no retry can succeed."""
     return isinstance(error, PERMANENT_ERRORS) or (isinstance(error, OSError) and error.errno in PERMANENT_ERRNOS)
+
+
+def quieten() -> None:
+    """Keep the tracebacks of expected errors, whose message is sufficient, out of the logs of flow and task runs."""
+    for name in LOGGERS:
+        logging.getLogger(name).addFilter(_without_traceback)
+
+
+def _without_traceback(record: logging.LogRecord) -> bool:
+    if record.exc_info and isinstance(record.exc_info[1], EXPECTED):
+        record.exc_info = record.exc_text = None
+    return True

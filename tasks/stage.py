@@ -16,8 +16,7 @@ from prefect.tasks import exponential_backoff
 from hnerf.models import has_model
 from tasks.bucket import Bucket
 from tasks.limits import limited
-from tasks.policy import Input, StorePolicy, artifacts_among, is_transient, stage_key
-from tasks.quiet import quieten
+from tasks.policy import Input, StorePolicy, artifacts_among, is_transient, quieten, stage_key
 from tasks.shared import get_or_compute
 from tasks.store import Artifact, Store
 

@@ -12,7 +12,7 @@ from prefect.context import FlowRunContext
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tasks.bucket import VARIABLE
-from tasks.quiet import LOGGERS
+from tasks.policy import LOGGERS
 from tasks.source import Source, read_capture
 from tasks.stage import Stage, image_count, stage
 from tasks.store import Artifact, Store
