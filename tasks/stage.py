@@ -85,17 +85,15 @@ class Stage(Generic[P]):
         given = {name: value for name, value in inputs.items() if name != NETWORKS}
         names = [one.name for one in artifacts_among(given.values())]
 
+        def write(out: Path) -> dict[str, float]:
+            with limited(self.name, image_count(given.values()), self.resumable):
+                return self.write(out, **given)  # type: ignore[call-arg, arg-type]
+
         def compute() -> Artifact:
-            return store.get_or_compute(
-                self.name, key, lambda out: self._write_in_time(out, given), self.resumable, names, self.checkpoint
-            )
+            return store.get_or_compute(self.name, key, write, self.resumable, names, self.checkpoint)
 
         bucket = Bucket.configured() if self.shared else None
         return get_or_compute(bucket, store, self.name, key, compute, self.checkpoint) if bucket else compute()
-
-    def _write_in_time(self, out: Path, inputs: dict[str, Input]) -> dict[str, float]:
-        with limited(self.name, image_count(inputs.values()), self.resumable):
-            return self.write(out, **inputs)  # type: ignore[call-arg, arg-type]
 
 
 def retried(function: Callable[P, T]) -> Callable[P, T]:
