@@ -355,7 +355,7 @@ def remove_checkpoint(folder: Path, name: str) -> None:
 def require_intact(subject: Path) -> None:
     """Raise InputError if an artifact to which `<store>/subjects/<name>` links has changed since it was recorded."""
     for link in sorted(subject.iterdir()):
-        root = link.resolve()
+        root = _linked(link)
         if link.name in STAGES and root.with_name(f"{root.name}.json").is_file():
             Store(root.parents[1]).intact(link.name, root.name)
 
@@ -364,11 +364,17 @@ def recording_digest(subject: Path) -> str:
     """Return the digest of the recording that `<store>/subjects/<name>` was trained on; "" if there is no record of
     it."""
     for stage in ("hands", "detection", "capture"):  # the last of them that ran
-        root = (subject / stage).resolve()
+        root = _linked(subject / stage)
         if root.is_dir():
             found = Store(root.parents[1]).find(stage, root.name)
             return found.digest if found else ""
     return ""
+
+
+def _linked(link: Path) -> Path:
+    """Return the place in the store to which a subject's link leads; the folder of its stage may be a link to another
+    disk, which is not followed."""
+    return Path(os.path.normpath(link.parent.resolve() / os.readlink(link))) if link.is_symlink() else link
 
 
 def sha256_of(path: Path) -> str:

@@ -13,7 +13,7 @@ from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.pose2sim import lens_from_table
-from hnerf.capture.lens import Lens
+from hnerf.capture.lens import Lens, by_name
 from hnerf.capture.manifest import read_manifest
 from hnerf.capture.safe_io import (
     VIDEO_SUFFIXES,
@@ -159,4 +159,4 @@ def read_lenses(path: Path) -> dict[str, Lens]:
     ]
     if not lenses:
         raise InputError(f"{path}: no tables of cameras with a matrix; give intri.yml or a TOML as in docs/formats.md")
-    return {lens.name: lens for lens in lenses}
+    return by_name(lenses, path)

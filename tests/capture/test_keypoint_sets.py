@@ -221,7 +221,7 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
     (tmp_path / "01.json").write_text(json.dumps([{}] * 129))
     with pytest.raises(InputError, match=r"01\.json: 129 people in 2 images; keep at most 64 in each"):
         read_results(tmp_path / "01.json", (0, 1))
-    for name in ("cover", -3, 1.5, True):
+    for name in ("cover", "walk_1234567890.png", -3, 1.5, True):  # a number of ten digits is no frame
         (tmp_path / "01.json").write_text(json.dumps([{"image_id": name, "keypoints": []}]))
         with pytest.raises(InputError, match=r"01\.json: no list of image_id"):
             read_results(tmp_path / "01.json", (0, 1, 3))

@@ -120,6 +120,15 @@ def test_lenses_that_a_calibration_estimated_are_used_only_if_their_file_is_name
     assert intri.getNode("K_b").mat()[0, 0] == 150
 
 
+def test_a_lens_file_with_two_cameras_of_one_name_is_refused(tmp_path: Path) -> None:
+    write_images(tmp_path, "a")
+    file = tmp_path / "lenses.toml"
+    lens = 'name = "a"\nsize = [2, 1]\nmatrix = [[15, 0, 9], [0, 15, 9], [0, 0, 1]]\ndistortions = [0, 0, 0, 0]\n'
+    file.write_text(f"[a]\n{lens}[b]\n{lens}")
+    with pytest.raises(InputError, match=r"lenses\.toml: two cameras are called a"):
+        Uncalibrated(tmp_path, file).lenses()
+
+
 def test_a_lens_file_of_other_cameras_is_refused(tmp_path: Path) -> None:
     write_images(tmp_path, "b")
     file = tmp_path / "lenses.toml"

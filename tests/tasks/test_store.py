@@ -426,6 +426,17 @@ def test_a_subject_copied_out_of_its_store_is_accepted(tmp_path: Path) -> None:
     require_intact(tmp_path / "ada")
 
 
+def test_a_subject_whose_stage_is_on_another_disk_is_found_in_its_store(tmp_path: Path) -> None:
+    """Its folder is a link."""
+    store, subject = Store(tmp_path / "store"), tmp_path / "store" / "subjects" / "ada"
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "hands").symlink_to(tmp_path / "disk")
+    made = store.link_latest("ada", store.get_or_compute("hands", "k", write_abc))
+    require_intact(subject)
+    assert recording_digest(subject) == made.digest
+
+
 def test_the_digest_of_the_recording_is_that_of_its_last_stage(tmp_path: Path) -> None:
     store, folder = Store(tmp_path), tmp_path / "subjects" / "ada"
     assert recording_digest(folder) == ""
