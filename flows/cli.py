@@ -35,6 +35,8 @@ FOLDERS = {
     "subject": "<store>/subjects/<name> of a finished `hnerf run`",
 }  # options of commands that are folders, and what each is
 
+# Variables that name a folder with caches, and where below it these are; the first that is set counts.
+CACHES = {"HNERF_MODELS": "", "ANNY_CACHE_DIR": "", "WARP_CACHE_PATH": "", "XDG_CACHE_HOME": "", "HOME": ".cache"}
 MOTIONS = "a BVH file, an AMASS .npz, another subject's folder, or t-pose"
 T_POSE = Path("t-pose")  # as in hnerf.render.motion, which imports torch
 
@@ -91,8 +93,17 @@ def _run(argv: list[str] | None) -> int:
 
         if error.filename is None or not is_permanent(error):
             raise
-        return _fail(f"{error.filename}: {error.strerror}; give another path, or mend this one", BAD_INPUT)
+        return _fail(f"{error.filename}: {error.strerror}; {_remedy(str(error.filename))}", BAD_INPUT)
     return 0
+
+
+def _remedy(path: str) -> str:
+    """Return what to do about a path that cannot be used. For a cache, or a folder above it, name its variable."""
+    for variable, below in CACHES.items():
+        cache = Path(os.environ.get(variable, ""), below)
+        if os.environ.get(variable) and (Path(path).is_relative_to(cache) or cache.is_relative_to(path)):
+            return f"it is needed for the cache {cache}; mend it, or let {variable} name another folder"
+    return "give another path, or mend this one"
 
 
 def _require_current_folder() -> None:

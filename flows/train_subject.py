@@ -140,7 +140,7 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
     if isinstance(error, Exception):
         why = str(error) if isinstance(error, EXPECTED) else f"{type(error).__name__}: {one_line(error)}"
         why = f"{why} (flow run {flow_run.name}, {flow_run.id})"
-        if is_of_the_machine(error) and not isinstance(error, StalledError):
+        if is_of_the_machine(error, capture) and not isinstance(error, StalledError):
             note_run(capture, store, f"failed: {why}", MACHINE)
             with suppress(OSError):  # of a full disk
                 release(store, capture, str(flow_run.id))

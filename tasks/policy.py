@@ -111,10 +111,17 @@ def is_retryable(error: object) -> bool:
     return isinstance(error, OSError | LostWorkerError) and not is_permanent(error)
 
 
-def is_of_the_machine(error: Exception) -> bool:
+def is_of_the_machine(error: Exception, capture: Path | str | None = None) -> bool:
     """Return whether an error comes from the machine and is no result of a study: a full disk or GPU, a killed
-    worker, or a store or bucket that cannot be reached."""
-    return isinstance(error, PlaceError) or is_retryable(error)
+    worker, or a store or bucket that cannot be reached. For a run of a capture, also any failed input or output outside
+    the capture's folder, such as a cache on a disk that became read-only."""
+    if isinstance(error, PlaceError) or is_retryable(error):
+        return True
+    return capture is not None and isinstance(error, OSError) and not _lies_in(str(error.filename), capture)
+
+
+def _lies_in(path: str, capture: Path | str) -> bool:
+    return isinstance(capture, Path) and Path(os.path.realpath(path)).is_relative_to(os.path.realpath(capture))
 
 
 def is_permanent(error: Exception) -> bool:

@@ -4,11 +4,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
-from flows.cli import CAMERA_FORMATS, ORBIT_PICTURES, PICTURES, SIZES_PX, STATURE_M, main
+from flows.cli import CACHES, CAMERA_FORMATS, ORBIT_PICTURES, PICTURES, SIZES_PX, STATURE_M, main
 from flows.train_subject import Trained, train_subject
 from hnerf import synthetic
 from hnerf.calibration.diagnosis import BODY_HEIGHT_M
@@ -109,6 +110,30 @@ def test_the_error_of_a_store_that_cannot_be_created_is_one_line_with_exit_code_
         assert main(["check-cameras", str(tmp_path / "ada"), "--store", str(store)]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"hnerf: {store}") and why in line
+
+
+@pytest.mark.parametrize(
+    ("variable", "missing", "cache"),
+    [
+        ("HOME", "", "/.cache"),
+        ("HOME", "/.cache/warp/1", "/.cache"),
+        ("WARP_CACHE_PATH", "/1", ""),
+        ("TMPDIR", "", None),
+    ],
+)
+def test_the_error_of_a_cache_that_cannot_be_used_names_its_variable(
+    variable: str, missing: str, cache: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    place = f"{tmp_path}/absent"
+    for other in CACHES:
+        monkeypatch.delenv(other, raising=False)
+    monkeypatch.setenv(variable, place)
+    lost = FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), place + missing)
+    monkeypatch.setattr(train_subject, "fn", Mock(side_effect=lost))
+    assert main(["run", str(tmp_path)]) == 2
+    remedy = f"it is needed for the cache {place}{cache}; mend it, or let {variable} name another folder"
+    remedy = remedy if cache is not None else "give another path, or mend this one"
+    assert capsys.readouterr().err == f"hnerf: {place}{missing}: No such file or directory; {remedy}\n"
 
 
 def test_an_unexpected_error_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,3 +1,4 @@
+import errno
 import os
 import shutil
 import subprocess
@@ -231,6 +232,22 @@ def test_a_fault_of_the_machine_uses_up_no_capture_and_is_not_held_against_it(
         text = (watched / ".refused" / "ada.txt").read_text()
         assert text.startswith(f"ada: failed: {VARIABLE}: ") and "refused" not in text and "not to blame" in text
         assert look(watched) == again
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOENT])
+@pytest.mark.parametrize(("place", "again"), [("captures/ada/images/0.jpg", []), ("home/.cache/warp", ["ada"])])
+def test_only_a_file_of_the_capture_itself_is_held_against_it(
+    number: int, place: str, again: list[str], watched: Path, monkeypatch: pytest.MonkeyPatch, prefect_api: str
+) -> None:
+    """A cache may be missing, forbidden, or on a disk that became read-only."""
+    every_run_is_the_one_that_was_started(monkeypatch)
+    look(watched)
+    unusable = OSError(number, os.strerror(number), str(watched.parent / place))
+    with monkeypatch.context() as patch, pytest.raises(OSError, match=place):
+        patch.setattr("flows.train_subject.train_avatar", Mock(side_effect=unusable))
+        train_subject(watched / "ada", store=watched.parent / "store")
+    assert ("Correct the folder" in (watched / ".refused" / "ada.txt").read_text()) == (again == [])
+    assert look(watched) == again
 
 
 def test_a_capture_whose_stage_stalled_is_not_started_again(
