@@ -158,14 +158,14 @@ def _captures(folder: Path) -> Iterator[Path]:
 
 def _listing(capture: Path) -> tuple[str, float]:
     """Return a digest of the names, sizes and times of a folder's files, and when one was last written, moved or
-    created (0 if there is none). The digest tells whether the folder was seen before without reading the files. The
-    time is the change time, since a copy may keep the original's modification time. A hidden file, such as a copy in
+    created (0 if there is none). The digest tells whether the folder was seen before without reading the files. Change
+    times are among its times, since a copy may keep the original's modification time. A hidden file, such as a copy in
     progress, counts only for the time."""
     listing, touched_s, files = hashlib.sha256(), 0.0, 0
     for entry in sorted(entries(capture, hidden=True), key=lambda entry: entry.path):
         stat = entry.stat(follow_symlinks=False)
         touched_s = max(touched_s, stat.st_ctime)
         if is_visible(entry.path.removeprefix(f"{capture}/")):
-            listing.update(os.fsencode(f"{entry.path} {stat.st_size} {stat.st_mtime_ns}\n"))
+            listing.update(os.fsencode(f"{entry.path} {stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns}\n"))
             files += 1
     return f"seen-{listing.hexdigest()}", touched_s if files else 0.0

@@ -91,6 +91,16 @@ def test_a_copy_or_a_new_name_is_the_same_capture_and_changed_content_a_new_one(
     assert look(watched) == ["ada"]
 
 
+def test_a_good_file_copied_over_a_damaged_one_of_the_same_size_and_time_is_noticed(watched: Path) -> None:
+    """As `cp -p` and `rsync -aI` do."""
+    image = watched / "ada" / "images" / "0.jpg"
+    os.utime(image, (1, 1))
+    assert look(watched) == ["ada", "bob"]
+    image.write_text("pixels of eve")
+    os.utime(image, (1, 1))
+    assert look(watched) == ["ada"]
+
+
 def test_captures_are_trained_again_after_the_store_was_deleted(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Prefect ignores an idempotency key that it knows. A repeated call after an interruption uses the same key, a new
     store another one."""
