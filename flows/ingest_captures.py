@@ -18,7 +18,7 @@ from pydantic import Field
 from flows.arguments import StoreFolder
 from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.config import load_settings, require_named_files
-from hnerf.errors import InputError
+from hnerf.errors import InputError, printable
 from hnerf.files import now_s
 from tasks import quarantine
 from tasks.bucket import Bucket, is_visible
@@ -78,7 +78,7 @@ def ingest_captures(
         if len(started) >= room:  # before the capture is read, or every look would read it again
             log.info("%s and what follows wait: %d runs have not ended", capture, max_unfinished)
             break
-        digest = _digest(capture, listing)
+        digest = _digest(capture, listing, ledger)
         if digest is None:
             continue
         if not ledger.knows(digest):
@@ -126,14 +126,18 @@ def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tup
             _refuse(capture, error)
 
 
-def _digest(capture: Path | str, listing: str) -> str | None:
+def _digest(capture: Path | str, listing: str, ledger: Ledger) -> str | None:
     """Return the digest of a capture's content; in a bucket, the listing takes its place. Return None, and note why, if
-    the capture cannot be read."""
+    the capture cannot be read, or could not be read a short time ago."""
     if isinstance(capture, str):
         return listing.removeprefix("seen-")
+    if why := ledger.refused(listing):
+        _refuse(capture, InputError(why))
+        return None
     try:
         return read_capture(capture)[0].digest
     except (InputError, OSError) as error:
+        ledger.note_refused(listing, printable(str(error)))
         _refuse(capture, error)
         return None
 

@@ -5,6 +5,7 @@
 <store>/ingested/<digest>.failed  the flow runs after which the capture was released because their machine failed
 <store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
 <store>/ingested/new-<listing>    a listing in a bucket that is not started yet; written when it was first seen
+<store>/ingested/refused-<listing>  why a folder with this listing cannot be read
 <store>/ingested/id               random, so that the same key in another ledger is another run
 """
 
@@ -15,6 +16,7 @@ from uuid import uuid4
 from hnerf.files import now_s, replace_text
 
 LOST, FAILED = ".lost", ".failed"
+RETRY_S = 3600  # after which a folder that could not be read is read again, although its listing is the same
 RELEASES = 3  # of a capture; the fault may be in every machine, or not in the machine after all
 
 
@@ -51,6 +53,17 @@ class Ledger:
         """Note the content of a folder with this listing."""
         replace_text(self.root / listing, digest)
         (self.root / f"new-{listing}").unlink(missing_ok=True)
+
+    def note_refused(self, listing: str, why: str) -> None:
+        """Note why a folder with this listing cannot be read."""
+        replace_text(self.root / f"refused-{listing}", why)
+
+    def refused(self, listing: str) -> str:
+        """Return why a folder with this listing could not be read; empty if it is time to try again: the reason may be
+        a disk or a right of access that has been mended since."""
+        path = self.root / f"refused-{listing}"
+        fresh = path.exists() and now_s(self.root) - path.stat().st_mtime < RETRY_S
+        return path.read_text(errors="replace") if fresh else ""
 
     def note_started(self, digest: str, capture: Path | str, run: object) -> None:
         """Note that a capture was started."""

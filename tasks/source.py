@@ -96,9 +96,29 @@ def entries(folder: Path | str, hidden: bool = False) -> Iterator["os.DirEntry[s
 
 
 def _parts(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files of the recording in a capture folder, and the files of its ground truth."""
+    """Return the files of the recording in a capture folder, and the files of its ground truth. Raises InputError if
+    one cannot be used: to read those before it may take hours."""
     files, truth = capture_files(folder), folder / GROUND_TRUTH
+    for path in files:
+        _require_usable(path, folder)
     return [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
+
+
+def _require_usable(path: Path, folder: Path) -> None:
+    """Raise InputError if a file cannot be opened, is too large or has a line break in its name or in what it links to,
+    with which two folders could have the same digest."""
+    name = str(path.relative_to(folder.parent))
+    try:
+        if path.lstat().st_size > MAX_FILE_BYTES:
+            raise InputError(f"{path}: has more than {MAX_FILE_BYTES >> 30} GiB; cut it")
+        if path.is_symlink():
+            name += os.readlink(path)
+        else:
+            path.open("rb").close()
+    except OSError as error:
+        _refuse(error, path)
+    if "\n" in name:
+        raise InputError(f"{path}: has a line break in its name, or in what it links to; rename it")
 
 
 def _digest(folder: Path, files: Iterable[Path]) -> str:
@@ -106,15 +126,10 @@ def _digest(folder: Path, files: Iterable[Path]) -> str:
     beside = folder.parent if folder.is_file() else folder
     for path in files:
         try:
-            if path.lstat().st_size > MAX_FILE_BYTES:
-                raise InputError(f"{path}: has more than {MAX_FILE_BYTES >> 30} GiB; cut it")
             content = os.readlink(path) if path.is_symlink() else sha256_of(path)
         except OSError as error:
             _refuse(error, path)
-        line = f"{content} {path.relative_to(beside)}"
-        if "\n" in line:  # otherwise, two folders could have the same digest
-            raise InputError(f"{path}: has a line break in its name, or in what it links to; rename it")
-        listing.update(os.fsencode(f"{line}\n"))
+        listing.update(os.fsencode(f"{content} {path.relative_to(beside)}\n"))
     return listing.hexdigest()
 
 

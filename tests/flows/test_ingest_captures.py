@@ -180,11 +180,36 @@ def test_a_refused_capture_is_logged_and_noted_until_it_is_changed_or_removed_an
         broken.setattr(module, "read_capture", unreadable)
         assert look(watched) == ["bob"]
     assert why in caplog.text and (noted / "ada.txt").read_text().startswith(f"ada: refused: {why}\n")
+    (watched / "ada" / "images" / "0.jpg").touch()
     assert look(watched) == ["ada"]
     assert list(noted.iterdir()) == []
     (noted / "gone.txt").touch()
     look(watched)
     assert list(noted.iterdir()) == [] and (watched / "ada" / "images").is_dir()
+
+
+def test_a_capture_that_cannot_be_read_is_read_again_only_once_it_has_changed_or_after_an_hour(
+    watched: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its reason stands, in the log and in its note."""
+    reads, why = (
+        Mock(side_effect=OSError(errno.EIO, "Input/output error", "0.jpg")),
+        "[Errno 5] Input/output error: '0.jpg'",
+    )
+    monkeypatch.setattr(module, "read_capture", reads)
+    shutil.rmtree(watched / "bob")
+
+    def reads_so_far() -> int:
+        assert look(watched) == [] and caplog.messages[-1] == why
+        assert (watched / ".refused" / "ada.txt").read_text().startswith(f"ada: refused: {why}\n")
+        return reads.call_count
+
+    assert (reads_so_far(), reads_so_far()) == (1, 1)
+    (noted,) = (watched.parent / "store" / "ingested").glob("refused-*")
+    os.utime(noted, (0, 0))
+    assert (reads_so_far(), reads_so_far()) == (2, 2)
+    (watched / "ada" / "images" / "0.jpg").touch()
+    assert reads_so_far() == 3
 
 
 def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> None:

@@ -148,6 +148,28 @@ def test_a_line_break_in_a_name_is_bad_input(folder: Path) -> None:
         digest(folder.rename(folder.with_name("a\nb")))
 
 
+@pytest.mark.parametrize("name", ["images/1\n.jpg", "ground_truth/z\n.ply", "images/locked.jpg", "images/sparse.mp4"])
+def test_what_is_wrong_with_a_file_is_said_before_any_is_read(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading them may take hours."""
+    (folder / name).touch()
+    if "sparse" in name:
+        os.truncate(folder / name, module.MAX_FILE_BYTES + 1)
+    opened, reads = Path.open, Mock(side_effect=module.sha256_of)
+
+    def locked(path: Path, *mode: str) -> object:
+        if "locked" in path.name:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, *mode)
+
+    monkeypatch.setattr(Path, "open", locked)
+    monkeypatch.setattr(module, "sha256_of", reads)
+    with pytest.raises(InputError, match=name.partition("\n")[0]):
+        read_capture(folder)
+    assert reads.call_count == 0
+
+
 def test_a_file_that_is_too_large_is_bad_input(folder: Path) -> None:
     with (folder / "sparse.mp4").open("wb") as file:
         file.truncate(module.MAX_FILE_BYTES + 1)
