@@ -30,7 +30,8 @@ def deployed(prefect_api: str) -> str:
     """Return the URL of a server that has the deployments of prefect.yaml."""
     with get_client(sync_client=True) as client:
         client.create_work_pool(WorkPoolCreate(name="local", type="process"))
-    with contextlib.chdir(ROOT):
+    with contextlib.chdir(ROOT), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PWD", "/tmp")  # as Ansible, cron and subprocess leave it
         invoke_and_assert(["--no-prompt", "deploy", "--all"])
     return prefect_api
 
@@ -70,6 +71,13 @@ def test_deployments_accept_a_capture_and_a_preset_or_study(deployed: str, flow:
     (run,) = runs_of(flow)
     assert run.parameters == parameters
     assert unfinished_runs() == before + (flow == "train-subject")
+
+
+def test_runs_work_in_the_checkout(deployed: str) -> None:
+    """Whatever the shell's folder was when Ansible, say, deployed."""
+    with get_client(sync_client=True) as client:
+        steps = [step for one in client.read_deployments() for step in one.pull_steps or ()]
+    assert steps == 5 * [{"prefect.deployments.steps.set_working_directory": {"directory": str(ROOT)}}]
 
 
 def test_every_parameter_of_every_deployment_has_a_description(deployed: str) -> None:
