@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import io
 import logging
 import os
 import select
@@ -49,6 +50,8 @@ def main(argv: list[str] | None = None) -> int:
     cannot be used; 1 for a training that cannot continue, an asset that must not be delivered, or output that nobody
     reads; 130 if interrupted from the keyboard; 143 after SIGTERM, 129 after SIGHUP."""
     open_closed_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as standard error: names outside the terminal's encoding
     try:
         return _run(argv)
     finally:

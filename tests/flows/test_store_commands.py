@@ -1,3 +1,5 @@
+import io
+import sys
 from argparse import ArgumentTypeError
 from pathlib import Path
 
@@ -30,6 +32,13 @@ def test_list_and_show_name_subjects_and_artifacts(store: Store, capsys: pytest.
         f"capture/{20:032x}", f"fit/{22:032x}", f"training/{23:032x}", f"asset/{24:032x}", f"evaluation/{24:032x}"
     ]  # fmt: skip
     assert main(["store", "show", "eve"]) == 2
+
+
+def test_names_outside_the_terminals_encoding_are_escaped(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_of(store, "Łukasz", 10)
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(printed := io.BytesIO(), "latin-1"))
+    assert main(["store", "list"]) == 0
+    assert b"\n\\u0141ukasz" in printed.getvalue()
 
 
 def test_nothing_is_removed_without_yes(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
