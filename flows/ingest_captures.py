@@ -76,7 +76,7 @@ def ingest_captures(
     for capture, listing in _unseen(folder, ledger, settle_s):
         room = max_unfinished - unfinished_runs() if room is None else room
         if len(started) >= room:  # before the capture is read, or every look would read it again
-            log.info("%s and what follows wait: %d runs have not ended", capture, max_unfinished)
+            log.info("%s and what follows wait: %d runs have not ended", printable(str(capture)), max_unfinished)
             break
         digest = _digest(capture, listing, ledger)
         if digest is None:
@@ -86,7 +86,7 @@ def ingest_captures(
             key = ledger.start_key(digest)
             run = run_deployment(DEPLOYMENT, parameters=parameters, timeout=0, as_subflow=False, idempotency_key=key)
             ledger.note_started(digest, capture, run.id)  # type: ignore[union-attr]
-            log.info("started %s for %s", DEPLOYMENT, capture)
+            log.info("started %s for %s", DEPLOYMENT, printable(str(capture)))
             quarantine.clear(capture)
             started.append(Path(capture).name)
         ledger.note_seen(listing, digest)
@@ -155,7 +155,8 @@ def _captures(folder: Path) -> Iterator[Path]:
         if path.name.startswith(".") or not path.is_dir():
             continue
         if path.is_symlink():
-            log.warning("%s: is a symbolic link and not followed; move the folder itself here", path)
+            # The server takes no log with a name that is not UTF-8.
+            log.warning("%s: is a symbolic link and not followed; move the folder itself here", printable(str(path)))
             continue
         yield path
 

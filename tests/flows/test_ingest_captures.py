@@ -382,6 +382,18 @@ def test_links_out_of_the_folder_are_not_followed(watched: Path, caplog: pytest.
     assert "ada: is a symbolic link and not followed" in caplog.text
 
 
+@pytest.mark.parametrize(("name", "room"), [(b"a\xff", 0), (b"a\x1b", 20)])
+def test_names_that_are_not_printable_are_escaped_in_the_log(
+    name: bytes, room: int, watched: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The server drops all records of a moment if one is not UTF-8."""
+    shutil.rmtree(watched / "bob")
+    (watched / "ada").rename(watched / os.fsdecode(name))
+    (watched / os.fsdecode(b"0\xff")).symlink_to(watched)
+    look(watched, max_unfinished=room)
+    assert len(caplog.messages) == 2 and all(message.isprintable() for message in caplog.messages)
+
+
 def test_runs_are_given_the_folders_by_the_names_that_other_machines_know(
     watched: Path, runs: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
