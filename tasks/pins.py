@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import IO
 from uuid import uuid4
 
+from hnerf.errors import PlaceError
 from hnerf.files import naming_full_disk
 
 FOLDER = ".running"
 READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
+NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 _own: dict[tuple[int, Path], IO[str]] = {}  # of this process and store; open until the process ends
 
 
@@ -42,13 +44,24 @@ def pinned(store: Path) -> set[str]:
             continue
         with file:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 names |= set(file.read().split())
             else:
                 with unless_read_only():
                     path.unlink(missing_ok=True)
     return names
+
+
+def flock(file: IO[str], how: int) -> None:
+    """Lock a file of the store, as flock(2) does. Raises PlaceError if its file system has no locks."""
+    try:
+        fcntl.flock(file, how)
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        folder, advice = Path(file.name).parent, "give --store a folder on a local disk or NFS 4"
+        raise PlaceError(f"{folder}: its file system has no locks ({error.strerror}); {advice}") from None
 
 
 @contextmanager
@@ -67,7 +80,7 @@ def _begin(store: Path) -> IO[str]:
     beside, path = store / FOLDER / f".{name}", store / FOLDER / name
     beside.parent.mkdir(exist_ok=True)
     file = beside.open("x")
-    fcntl.flock(file, fcntl.LOCK_EX)
+    flock(file, fcntl.LOCK_EX)
     os.replace(beside, path)
     _own[os.getpid(), store] = file
     return file

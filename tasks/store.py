@@ -38,7 +38,7 @@ from pydantic import BaseModel, Field, FiniteFloat
 
 from hnerf.errors import InputError, PlaceError
 from hnerf.files import atomic_file, made_folder, naming_full_disk, replace_text
-from tasks.pins import pin, unless_read_only
+from tasks.pins import flock, pin, unless_read_only
 
 log = logging.getLogger("hnerf.store")
 
@@ -283,12 +283,12 @@ class Store:
                         raise
                     continue
                 try:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
                     if not wait:
                         raise
                     log.info("waiting for another process that is working on %s %s", stage, key)
-                    fcntl.flock(lock, fcntl.LOCK_EX)
+                    flock(lock, fcntl.LOCK_EX)
                 if not _is_at(path, lock.fileno()):
                     continue  # the process that held it has removed it
                 try:

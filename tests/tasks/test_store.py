@@ -1,4 +1,5 @@
 import errno
+import fcntl
 import math
 import multiprocessing
 import os
@@ -14,7 +15,8 @@ from unittest.mock import Mock
 
 import pytest
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
+from tasks import pins
 from tasks.garbage import collect, find_garbage
 from tasks.inventory import Inventory
 from tasks.store import RECORDING, Artifact, Store, recording_digest, remove, require_intact
@@ -42,6 +44,19 @@ def test_artifact_is_recorded_with_digests_and_found_again(tmp_path: Path) -> No
     assert made.root == tmp_path / "fit" / "k"
     assert {name: (file.sha256, file.size_bytes) for name, file in made.files.items()} == {"deep/letters": (ABC, 3)}
     assert made.metrics == {"letters": 3.0}
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_store_on_a_file_system_without_locks_is_refused(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as NFS without lockd: nothing can be made there, and nothing that is there can be pinned."""
+    Store(tmp_path / "old").get_or_compute("fit", "k", write_abc)
+    monkeypatch.setattr(fcntl, "flock", Mock(side_effect=OSError(number, os.strerror(number))))
+    monkeypatch.setattr(pins, "_own", {})
+    for name in ("new", "old"):
+        with pytest.raises(PlaceError, match=rf"{name}/[.a-z]+: its file system has no locks .*; give --store a fol"):
+            Store(tmp_path / name).get_or_compute("fit", "k", never)
 
 
 def test_digest_depends_only_on_names_and_bytes(tmp_path: Path) -> None:
