@@ -1,6 +1,7 @@
 """Units of systemd for server and worker, as services of a user: python -m flows.systemd_units FOLDER."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from hnerf.errors import InputError
@@ -8,10 +9,10 @@ from hnerf.errors import InputError
 ROOT = Path(__file__).parents[1]
 
 
-def units(root: Path) -> dict[str, str]:
-    """Return the text of each unit, by file name, for a checkout at `root`. The worker ends with all its runs; what
-    they have finished is in the store."""
-    folder, prefect = _escaped(root), _escaped(root / ".venv" / "bin" / "prefect")
+def units(root: Path, program: Path) -> dict[str, str]:
+    """Return the text of each unit, by file name, for a checkout at `root` and Prefect's program. The worker ends with
+    all its runs; what they have finished is in the store."""
+    folder, prefect = _escaped(root), _escaped(program)
     server = f'"{prefect}" server start'
     worker = f'"{prefect}" worker start --pool local --type process --limit 5'
     return {
@@ -54,8 +55,11 @@ def main(argv: list[str] | None = None) -> None:
     folder = parser.parse_args(argv).folder
     if not folder.is_dir():
         parser.exit(2, f"{folder}: no such folder; make it first\n")
+    prefect = Path(sys.executable).with_name("prefect")
+    if not prefect.is_file():
+        parser.exit(2, f"{prefect}: no such program; run `make install`, and this with .venv/bin/python\n")
     try:
-        texts = units(ROOT)
+        texts = units(ROOT, prefect)
     except InputError as error:
         parser.exit(2, f"{error}\n")
     for name, text in texts.items():

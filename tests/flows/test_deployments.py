@@ -49,7 +49,7 @@ def test_the_worker_has_room_for_all_deployments_at_once() -> None:
     deployments = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
     limits = [one["concurrency_limit"] for one in deployments]
     room = sum(one["limit"] if isinstance(one, dict) else one for one in limits)
-    assert f"--limit {room}\n" in units(ROOT)["hnerf-worker.service"]
+    assert f"--limit {room}\n" in units(ROOT, Path("prefect"))["hnerf-worker.service"]
 
 
 def test_cron_deployment_yields_scheduled_runs_five_minutes_apart(deployed: str) -> None:
