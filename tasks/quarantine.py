@@ -1,6 +1,7 @@
 """Notes on why captures of a watched folder gave no result: <folder>/.refused/<name>.txt. The captures stay in
 place."""
 
+import hashlib
 import os
 import time
 from contextlib import suppress
@@ -51,14 +52,23 @@ def clear_removed(folder: Path) -> None:
     """Remove the notes about captures that are no longer in the watched folder; links are not followed."""
     if (folder / FOLDER).is_symlink():
         return
+    kept = {_name(name) for name in os.listdir(folder)}
     for path in (folder / FOLDER).glob("*.txt"):
-        if not os.path.lexists(folder / path.name.removesuffix(".txt")):
+        if path.name not in kept:
             path.unlink(missing_ok=True)
 
 
 def _path(capture: Path) -> Path:
     """Return the path of the note. Raises OSError if a link there leads elsewhere."""
-    path = capture.parent / FOLDER / f"{capture.name}.txt"
+    path = capture.parent / FOLDER / _name(capture.name)
     if path.parent.is_symlink():
         raise NotADirectoryError(f"{path.parent}: is a symbolic link; remove it")
     return path
+
+
+def _name(capture: str) -> str:
+    """Return the name of a capture's note. If the capture's own is too long to append to, a digest stands for its end:
+    a name may have 255 bytes, and a character up to four."""
+    if len(os.fsencode(capture)) > 250:
+        capture = f"{capture[:50]}-{hashlib.sha256(os.fsencode(capture)).hexdigest()[:8]}"
+    return f"{capture}.txt"

@@ -212,6 +212,22 @@ def test_a_capture_that_cannot_be_read_is_read_again_only_once_it_has_changed_or
     assert reads_so_far() == 3
 
 
+@pytest.mark.parametrize("character", [b"x", "\u8a18".encode(), "\U0001f600".encode(), b"\xff"])
+def test_a_capture_with_a_long_name_has_a_note_too(character: bytes, watched: Path) -> None:
+    name = os.fsdecode(character * (255 // len(character)))
+    others = [watched / "ada", watched / f"{name[:-1]}y"]
+    for capture in (*others, watched / name):
+        capture.mkdir(exist_ok=True)
+        quarantine.note(capture, "refused: x")
+    quarantine.clear_removed(watched)
+    assert len(list(watched.glob(".refused/*.txt"))) == 3
+    quarantine.clear(watched / name)
+    assert len(list(watched.glob(".refused/*.txt"))) == 2
+    (watched / f"{name[:-1]}y").rmdir()
+    quarantine.clear_removed(watched)
+    assert [path.name for path in watched.glob(".refused/*.txt")] == ["ada.txt"]
+
+
 def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (watched / ".refused").symlink_to(tmp_path / "elsewhere")
