@@ -2,6 +2,7 @@
 
 import logging
 from datetime import UTC, datetime, timedelta
+from email.utils import parsedate_to_datetime
 from typing import Any
 
 from prefect import get_client
@@ -44,13 +45,14 @@ def restart_crashed(max_restarts: int) -> list[tuple[FlowRun, str]]:
     it completes: set back to Running, it would finally release a slot that it no longer holds."""
     given_up = []
     with get_client(sync_client=True) as client:
+        now = parsedate_to_datetime(client.hello().headers["Date"])  # by the clock that dates runs and heartbeats
         for run in _all_runs(client, StateType.CRASHED):
-            if datetime.now(UTC) - _last_sign(client, run) < QUIET:
+            if now - _last_sign(client, run) < QUIET:
                 log.info("%s crashed, but its process may still be running: not restarted yet", run.name)
                 continue
             before = [state.message == AGAIN for state in client.read_flow_run_states(run.id)].count(True)
             if before < max_restarts:
-                again: State[None] = Scheduled(scheduled_time=datetime.now(UTC) + RELEASE, message=AGAIN)
+                again: State[None] = Scheduled(scheduled_time=now + RELEASE, message=AGAIN)
                 client.set_flow_run_state(run.id, again, force=True)
                 log.warning("%s crashed and is restarted, attempt %d of %d", run.name, before + 1, max_restarts)
             else:

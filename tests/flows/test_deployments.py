@@ -4,6 +4,7 @@ import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -23,6 +24,7 @@ from flows.systemd_units import units
 
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE_S = 60.0
+AT_ONCE = timedelta(seconds=-5)  # the server tells the time in whole seconds
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +112,7 @@ def test_wrong_parameters_are_refused_before_a_run_is_created(
 
 
 def test_a_crashed_run_is_restarted_a_few_times_and_then_fails(deployed: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(restart, "QUIET", timedelta(0))
+    monkeypatch.setattr(restart, "QUIET", AT_ONCE)
     run = run_deployment("train-subject/local", parameters={"capture": "/recordings/bob"}, timeout=0)
     with get_client(sync_client=True) as client:
         for _ in range(2):
@@ -139,13 +141,29 @@ def test_a_run_that_may_live_is_not_started_a_second_time(deployed: str, monkeyp
         while (alive := restart._last_sign(client, crashed)) == ended and time.monotonic() < deadline:
             time.sleep(0.5)
         assert crashed.state and ended == crashed.state.timestamp < alive
-        for quiet, state in ((restart.QUIET, "Crashed"), (timedelta(0), "Scheduled")):
+        for quiet, state in ((restart.QUIET, "Crashed"), (AT_ONCE, "Scheduled")):
             monkeypatch.setattr(restart, "QUIET", quiet)
             assert restart_crashed(max_restarts=2) == []
             assert client.read_flow_run(run).state_name == state
         client.set_flow_run_state(run, Crashed(), force=True)
         client.set_flow_run_state(run, Completed())
         assert client.read_flow_run(run).state_name == "Completed"
+
+
+@pytest.mark.parametrize("skew", [timedelta(minutes=-5), timedelta(minutes=5)])
+def test_a_wrong_clock_of_the_scanning_machine_restarts_no_run_earlier(
+    skew: timedelta, deployed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_deployment("train-subject/local", parameters={"capture": "/recordings/joe"}, timeout=0).id
+    monkeypatch.setattr(restart, "datetime", Mock(now=lambda zone: datetime.now(zone) + skew))
+    with get_client(sync_client=True) as client:
+        client.set_flow_run_state(run, Crashed(), force=True)
+        for quiet, state in ((restart.QUIET, "Crashed"), (AT_ONCE, "Scheduled")):
+            monkeypatch.setattr(restart, "QUIET", quiet)
+            assert restart_crashed(max_restarts=2) == []
+            assert client.read_flow_run(run).state_name == state
+        begins = client.read_flow_run(run).next_scheduled_start_time
+        assert begins and RELEASE / 2 < begins - datetime.now(UTC) <= RELEASE
 
 
 def test_runs_beyond_one_page_of_the_server_are_counted(deployed: str, monkeypatch: pytest.MonkeyPatch) -> None:
