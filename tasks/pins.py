@@ -5,15 +5,19 @@
 
 import errno
 import fcntl
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import IO
 from uuid import uuid4
 
 from hnerf.errors import PlaceError
 from hnerf.files import naming_full_disk
+
+log = logging.getLogger("hnerf.pins")
 
 FOLDER = ".running"
 READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
@@ -22,9 +26,14 @@ _own: dict[tuple[int, Path], IO[str]] = {}  # of this process and store; open un
 
 
 def pin(store: Path, name: str) -> None:
-    """Note that this process uses an artifact from now on. In a read-only store, nothing is noted."""
+    """Note that this process uses an artifact from now on. In a read-only store, nothing is noted; warn if others may
+    write into it."""
     with unless_read_only(), naming_full_disk(store):
-        file = _own.get((os.getpid(), store)) or _begin(store)
+        try:
+            file = _own.get((os.getpid(), store)) or _begin(store)
+        except PermissionError:
+            _warn_of_others(store)
+            raise
         file.write(f"{name}\n")
         file.flush()
 
@@ -72,6 +81,11 @@ def unless_read_only() -> Iterator[None]:
     except OSError as error:
         if error.errno not in READ_ONLY:
             raise
+
+
+@cache
+def _warn_of_others(store: Path) -> None:
+    log.warning("%s: not writable for this user: `hnerf store gc` of its owner may remove what is being read", store)
 
 
 def _begin(store: Path) -> IO[str]:

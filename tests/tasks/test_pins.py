@@ -36,6 +36,18 @@ def test_in_a_read_only_store_nothing_is_pinned(tmp_path: Path, monkeypatch: pyt
     assert pinned(tmp_path) == set()
 
 
+@pytest.mark.parametrize(("number", "warnings"), [(errno.EROFS, 0), (errno.EACCES, 1), (errno.EPERM, 1)])
+def test_who_may_not_write_into_a_store_that_others_clean_up_is_warned_once(
+    number: int, warnings: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(pins, "_begin", Mock(side_effect=OSError(number, os.strerror(number))))
+    for name in ("fit/1", "fit/2"):
+        pin(tmp_path, name)
+    assert caplog.messages == warnings * [
+        f"{tmp_path}: not writable for this user: `hnerf store gc` of its owner may remove what is being read"
+    ]
+
+
 def test_a_full_disk_is_not_treated_as_a_read_only_store() -> None:
     with pytest.raises(OSError, match="full"), unless_read_only():
         raise OSError(errno.ENOSPC, "full")
