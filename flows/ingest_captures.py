@@ -59,6 +59,7 @@ def ingest_captures(
         min_free_gib: Start nothing while the store's disk has less free space than this, in GiB.
     """
     ledger = Ledger.of(store)
+    ledger.sweep()
     folder = path_or_url(folder)
     if isinstance(folder, Path):
         folder.mkdir(parents=True, exist_ok=True)

@@ -17,6 +17,7 @@ from hnerf.files import now_s, replace_text
 
 LOST, FAILED = ".lost", ".failed"
 RETRY_S = 3600  # after which a folder that could not be read is read again, although its listing is the same
+STALE_S = 2 * 86400  # a listing waits for at most a day (`settle_s`)
 RELEASES = 3  # of a capture; the fault may be in every machine, or not in the machine after all
 
 
@@ -48,6 +49,13 @@ class Ledger:
         if not path.exists():
             replace_text(path, "")
         return now_s(self.root) - path.stat().st_mtime
+
+    def sweep(self) -> None:
+        """Remove notes about listings that nobody asked for lately: their folders have changed since."""
+        stale_s = now_s(self.root) - STALE_S
+        for path in (*self.root.glob("new-*"), *self.root.glob("refused-*")):
+            if path.stat().st_mtime < stale_s:
+                path.unlink()
 
     def note_seen(self, listing: str, digest: str) -> None:
         """Note the content of a folder with this listing."""

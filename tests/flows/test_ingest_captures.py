@@ -459,6 +459,9 @@ def test_captures_in_a_bucket_are_started_by_their_url(bucket: str, tmp_path: Pa
     (one,) = ingest_captures.fn(bucket, "demo", store, 60.0)
     (other,) = ingest_captures.fn(bucket, "demo", store, 0.0)
     assert {one, other} == {"ada", "bob"}
+    (store / "ingested" / "new-seen-half").touch()
+    os.utime(store / "ingested" / "new-seen-half", (0, 0))  # of an upload that has grown since
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == []
     assert {run["capture"] for run in runs} == {f"{bucket}/ada", f"{bucket}/bob"}
     assert not list((store / "ingested").glob("new-*"))
     fs.copy(f"{bucket}/ada/a.mp4", f"{bucket}/copy of ada/a.mp4")

@@ -5,7 +5,7 @@ from unittest.mock import Mock
 import pytest
 
 from hnerf.files import now_s
-from tasks.ledger import Ledger, forget, release, started_from
+from tasks.ledger import STALE_S, Ledger, forget, release, started_from
 
 DIGEST, OTHER = "a" * 64, "b" * 64
 
@@ -59,6 +59,20 @@ def test_the_age_of_a_listing_counts_from_its_first_query(tmp_path: Path) -> Non
     assert 100 <= ledger.stood_s("seen-ada") < 150 and 100 <= ledger.stood_s("seen-ada") < 150
     ledger.note_seen("seen-ada", DIGEST)
     assert ledger.stood_s("seen-ada") < 50
+
+
+def test_notes_about_listings_that_have_changed_since_are_removed(tmp_path: Path) -> None:
+    """A growing upload has another listing at every look."""
+    ledger, old_s = Ledger.of(tmp_path), now_s(tmp_path) - STALE_S - 1
+    for listing in ("seen-old", "seen-new"):
+        ledger.stood_s(listing)
+        ledger.note_refused(listing, "0.jpg: cannot be read")
+        ledger.note_seen(f"{listing}er", DIGEST)
+    for path in ledger.root.glob("*-old*"):
+        os.utime(path, (old_s, old_s))
+    ledger.sweep()
+    left = {"new-seen-new", "refused-seen-new", "seen-older", "seen-newer"}
+    assert {path.name for path in ledger.root.iterdir()} == left
 
 
 @pytest.mark.usefixtures("wrong_clock")
