@@ -13,7 +13,8 @@ def display() -> Iterator[None]:
     """Show the log instead of using Prefect's console handler, which writes to standard error."""
     logger, level = logging.getLogger("hnerf"), log.level
     handler = TerminalHandler() if sys.stdout.isatty() else LineHandler(sys.stdout)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    times = "%H:%M:%S" if sys.stdout.isatty() else "%Y-%m-%d %H:%M:%S %z"  # a file may be read days later
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", times))
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     logger.propagate = False

@@ -1,5 +1,6 @@
 import io
 import logging
+import re
 import sys
 
 import pytest
@@ -37,7 +38,7 @@ def test_other_outputs_show_only_log_lines(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(sys, "stdout", file := io.StringIO())
     work()
     (line,) = file.getvalue().splitlines()
-    assert line.endswith(" hnerf.stage: training: [1/2]")
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d [+-]\d{4} hnerf\.stage: training: \[1/2\]", line)
 
 
 def test_a_closed_pipe_prints_no_traceback_per_line(
