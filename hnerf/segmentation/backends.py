@@ -39,12 +39,14 @@ def choose_backend(capture: Capture, camera: str, prior_of: PriorOf, fitted: boo
         return Backend("given", partial(given_mask, capture, camera))
     if network is not None:
         return Backend("learned model", partial(_learned_mask, capture, camera, network))
+    name = "median around the fitted body" if fitted else "median around the detected person"
     by_prior = capture.background(camera) is None
-    if by_prior and not fitted and not capture.has_person_masks:
+    if not by_prior:
+        name = "clean plate"
+    elif not fitted and not capture.has_person_masks:
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
-    name = f"median around the {'fitted body' if fitted else 'detected person'}" if by_prior else "clean plate"
     return Backend(name, background_subtraction(capture, camera, prior_of, MEDIAN_FRAMES), by_prior)
 
 
