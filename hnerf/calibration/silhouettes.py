@@ -184,21 +184,25 @@ class _RaysNearHull:
     ) -> "_RaysNearHull":
         """Search the rays of a camera within `reach_m` of their points closest to the centre."""
         camera, outline = seen[name]
-        origins, directions = camera.rays(outline.points_px)
+        rays = origins, directions = camera.rays(outline.points_px)
         nearest_m = ((centre_m - origins) * directions).sum(-1, keepdims=True)
         step_m = 2 * reach_m / (COARSE - 1)
-        near = _RaysNearHull._at(name, seen, (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m))
+        near = _RaysNearHull._at(name, seen, rays, (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m))
         for _ in range(2):
             best_m = np.take_along_axis(near.along_m, near._outside_hull_px().argmin(1)[:, None], 1)
-            near = _RaysNearHull._at(name, seen, best_m + np.linspace(-step_m, step_m, FINE))
+            near = _RaysNearHull._at(name, seen, rays, best_m + np.linspace(-step_m, step_m, FINE))
             step_m *= 2 / (FINE - 1)
         return near
 
     @staticmethod
-    def _at(name: str, seen: Mapping[str, tuple[Camera, MaskOutline]], along_m: np.ndarray) -> "_RaysNearHull":
-        """Sample the rays of a camera at distances (n, S)."""
-        camera, outline = seen[name]
-        origins, directions = camera.rays(outline.points_px)
+    def _at(
+        name: str,
+        seen: Mapping[str, tuple[Camera, MaskOutline]],
+        rays: tuple[np.ndarray, np.ndarray],
+        along_m: np.ndarray,
+    ) -> "_RaysNearHull":
+        """Sample the rays of a camera, origins and directions (n, 3), at distances (n, S)."""
+        origins, directions = rays
         points_m = origins[:, None] + along_m[..., None] * directions[:, None]
         outside_px = {other: _outside_px(*seen[other], points_m) for other in seen if other != name}
         return _RaysNearHull(name, seen, along_m, points_m, outside_px)
@@ -210,9 +214,9 @@ class _RaysNearHull:
         seen = {**self.seen, **changed}
         if self.name in changed:
             camera, outline = changed[self.name]
-            origins, directions = camera.rays(outline.points_px)
+            rays = origins, directions = camera.rays(outline.points_px)
             along_m = ((self.points_m - origins[:, None]) * directions[:, None]).sum(-1)
-            return _RaysNearHull._at(self.name, seen, along_m)
+            return _RaysNearHull._at(self.name, seen, rays, along_m)
         outside_px = {**self.outside_px, **{name: _outside_px(*of, self.points_m) for name, of in changed.items()}}
         return dataclasses.replace(self, seen=seen, outside_px=outside_px)
 
