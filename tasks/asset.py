@@ -12,7 +12,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("asset", version="42", networks=tuple(THREE_SHA256))
+@stage("asset", version="43", networks=tuple(THREE_SHA256))
 def export(
     out: Path,
     recording: Artifact,

@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("scoring", version="17", networks=(LPIPS_ALEXNET,))
+@stage("scoring", version="18", networks=(LPIPS_ALEXNET,))
 def score_training(
     out: Path,
     truth: Source,
@@ -30,7 +30,7 @@ def score_training(
     return {} if psnr is None else {"psnr": psnr}
 
 
-@stage("scoring-end", version="7", networks=(LPIPS_ALEXNET,))
+@stage("scoring-end", version="8", networks=(LPIPS_ALEXNET,))
 def score_end_of_training(
     out: Path,
     truth: Source,

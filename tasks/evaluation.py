@@ -19,7 +19,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("evaluation", version="22", networks=(LPIPS_ALEXNET,))
+@stage("evaluation", version="23", networks=(LPIPS_ALEXNET,))
 def evaluate(
     out: Path,
     truth: Source,

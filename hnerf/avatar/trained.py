@@ -1,4 +1,4 @@
-"""A field, built for training, and loaded again as part of an Avatar."""
+"""Build a field for training, and load a trained one as an Avatar."""
 
 import dataclasses
 import json

@@ -86,7 +86,7 @@ def _frame(image_id: object) -> int:
     ValueError if there is none."""
     if type(image_id) is int and image_id >= 0:
         return image_id
-    found = re.search(r"(?<![0-9])([0-9]{1,9})(\.\w+)?$", image_id) if isinstance(image_id, str) else None
+    found = re.search(r"(?<![0-9])0*([0-9]{1,9})(\.\w+)?$", image_id) if isinstance(image_id, str) else None
     if not found:
         raise ValueError(image_id)
     return int(found[1])

@@ -75,7 +75,8 @@ class Uncalibrated(Layout):
     only: str | None = None
     found_clocks: Mapping[str, Clock] | None = None
     calibrated: Layout | None = None
-    _opened: dict[str, Footage] = field(default_factory=dict, init=False)  # so far: opening a video decodes all of it
+    # Opened so far: opening a video decodes all of it.
+    _opened: dict[str, Footage] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def known_lenses(self) -> dict[str, KnownLens]:

@@ -55,11 +55,11 @@ def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], o
 
 
 def rgba(rendering: Rendering) -> np.ndarray:
-    """Convert a rendering to (H, W, 4) uint8: colour over black, and coverage. Raises RuntimeError if a value is not
-    finite, which would become black."""
+    """Convert a rendering to (H, W, 4) uint8: colour over black, and coverage. Raises InputError if a value is NaN,
+    which would become black."""
     both = torch.cat([rendering.rgb, rendering.alpha[..., None]], -1)
-    if not both.isfinite().all():
-        raise RuntimeError("the field renders values that are not finite; train it again")
+    if both.isnan().any():
+        raise InputError("the trained field renders NaN; train it with another training.seed")
     return (both.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 

@@ -70,7 +70,7 @@ class Draws:
     def deterministic(
         rays: int, samples: int, device: torch.device, spacing_m: Tensor | float | None = None
     ) -> "Draws":
-        """Return the numbers for rendering: every sample in the middle of its stratum, over black."""
+        """Return the numbers for rendering: every sample in the middle of its stratum."""
         middle = torch.full((rays, samples), 0.5, device=device)
         return Draws(middle, torch.zeros(rays, 3, device=device), middle, spacing_m=_by_ray(spacing_m, rays, device))
 

@@ -144,11 +144,21 @@ class FastField(Field):
         """Return the deformations."""
         return [] if self.deformation is None else [self.deformation.displacement]
 
-    def sample(
-        self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws, directions: Tensor | None = None
+    def sample(self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
+        """Evaluate rays as Field.sample does, in the shell alone."""
+        return self._sample(scene, rays, draws, None)
+
+    def render_beside(self, scene: PosedScene[ShellGrid], rays: Rays, directions: Tensor) -> Tensor:
+        """Render M neighbours of each ray as Field.render_beside does. Their descriptors are derived, to first order,
+        from the closest points of the ray between them: a quarter of a pixel away, these are the same."""
+        seen = composited(*self._sample(scene, rays, self.rendering_draws(scene, rays), directions))
+        return seen.unflatten(0, (len(directions), -1))
+
+    def _sample(
+        self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws, directions: Tensor | None
     ) -> tuple[RaySamples, Tensor]:
-        """Evaluate rays as Field.sample does, in the shell alone; with directions (M, R, 3), the M R neighbours along
-        these instead, at the depths of the rays themselves."""
+        """Evaluate rays or, with directions (M, R, 3), the M R neighbours along these, at the depths of the rays
+        themselves."""
         depths, count, core = scene.region.sample_rays(rays, draws.jitter, draws.spacing_m)
         # Only samples that count are evaluated, one ray after another; slots: their places among all, (N,).
         slots = torch.nonzero((torch.arange(depths.shape[1], device=count.device) < count[:, None]).flatten())[:, 0]
@@ -199,12 +209,6 @@ class FastField(Field):
         d, residual, surface_m = on_rays(d, self.reach_m), on_rays(residual, 0.0), on_rays(surface_m.detach(), 0.0)
         found = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, elastic, surface_m)
         return found, depths
-
-    def render_beside(self, scene: PosedScene[ShellGrid], rays: Rays, directions: Tensor) -> Tensor:
-        """Render M neighbours of each ray as Field.render_beside does. Their descriptors are derived, to first order,
-        from the closest points of the ray between them: a quarter of a pixel away, these are the same."""
-        seen = composited(*self.sample(scene, rays, self.rendering_draws(scene, rays), directions))
-        return seen.unflatten(0, (len(directions), -1))
 
     def coverage(self, samples: RaySamples) -> Tensor:
         """Return the coverage by the surface, not by the solid core that ends rays behind it; rays that start inside

@@ -191,8 +191,8 @@ class Boxes:
 
 
 def box_interval(rays: Rays, lower_m: Tensor, upper_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Return entry and exit depths (R,) of rays in axis-aligned boxes (R, 3) by the slab method; equal where the box is
-    missed, at the first exit from a slab, since a ray parallel to another enters that one at infinity."""
+    """Return entry and exit depths (R,) of rays in axis-aligned boxes (R, 3) by the slab method. Where the box is
+    missed, both are the first exit from a slab: the last entry may be at infinity."""
     inverse = 1 / torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
     a, b = (lower_m - rays.origins_m) * inverse, (upper_m - rays.origins_m) * inverse
     far = torch.maximum(a, b).amin(-1).clamp(min=0)

@@ -1,6 +1,6 @@
 """The losses (docs/method.md): H-NeRF's nine, and three more. Sums over rays are means over rays here, so that a
-batch's size does not change the balance; sums over a ray's samples stay sums. The weights in `paper` are the paper's
-in this form, so `inc`, which is no sum over rays, weighs more than there, except in `print` (docs/method.md).
+batch's size does not change the balance; sums over a ray's samples stay sums. Preset `paper` has the printed weights.
+`inc` is no sum over rays, so it weighs more than in the paper; preset `print` corrects that (docs/method.md).
 """
 
 from dataclasses import dataclass

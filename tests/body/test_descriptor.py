@@ -133,8 +133,8 @@ def test_gradients_by_the_pose_match_finite_differences(name: str, index: tuple[
 
 
 def test_gradients_of_y_are_nearly_right_where_skin_blends_between_joints(rig: Rig) -> None:
-    """They take the skin for rigid: right at rest; with all joints turned by about 20 degrees, off by 5 to 6 % in the
-    mean, by central differences over 0.6 mm at points 3 to 23 mm from the body."""
+    """They take the skin for rigid: right at rest; with all joints turned by about 20 degrees, off by 6 % in the mean,
+    by central differences over 0.6 mm at points 3 to 23 mm from the body."""
     random, step = torch.Generator().manual_seed(0), 3e-4
     turned = torch.zeros(1, len(rig.joint_names), 3)
     turned[:, rig.free] = 0.23 * torch.randn(1, int(rig.free.sum()), 3, generator=random)
@@ -157,7 +157,7 @@ def test_gradients_of_y_are_nearly_right_where_skin_blends_between_joints(rig: R
         assert inside.sum() > 1000
         relative = (found - wanted).flatten(1).norm(dim=1) / wanted.flatten(1).norm(dim=1)
         errors.append(relative[inside].mean().item())
-    assert errors[0] < 0.002 and 0.03 < errors[1] < 0.08
+    assert errors[0] < 0.002 and errors[1] < 0.07
 
 
 def growing_box() -> Rig:

@@ -64,17 +64,17 @@ def test_the_points_of_a_palm_count_as_one_observation() -> None:
 
 
 def test_observations_of_hands_seen_by_one_camera_are_dropped() -> None:
-    """Both cameras see the left hand, the second one with a single sure point; only the first one sees the right hand
-    with confidence."""
-    found = {"0": np.full((1, 2, 21, 3), 0.9), "1": np.full((1, 2, 21, 3), 0.4)}
+    """Two of three cameras see the left hand, the second one with a single sure point; only the first one sees the
+    right hand with confidence."""
+    found = {"0": np.full((1, 2, 21, 3), 0.9), "1": np.full((1, 2, 21, 3), 0.4), "2": np.full((1, 2, 21, 3), 0.1)}
     found["1"][0, 0, 20, 2] = 0.6
-    capture: Any = SimpleNamespace(
-        train_cameras=("0", "1"), cameras=dict(zip("01", CAMERAS, strict=True)), hands=found.get
-    )
+    cameras = dict(zip("012", (*CAMERAS, CAMERAS[0]), strict=True))
+    capture: Any = SimpleNamespace(train_cameras=("0", "1", "2"), cameras=cameras, hands=found.get)
     views = observe_hands(capture)
-    assert views is not None and views.cameras == CAMERAS
-    assert views.confidence[:, 0, [0, 20, 21, 41]].tolist() == [[0.9, 0.9, 0, 0], [0.4, 0.6, 0, 0]]
-    for names in (("0",), ("0", "2")):  # a single camera, and one without hand detection
+    assert views is not None and views.cameras == tuple(cameras.values())
+    sure = [[0.9, 0.9, 0, 0], [0.4, 0.6, 0, 0], [0.1, 0.1, 0, 0]]
+    assert views.confidence[:, 0, [0, 20, 21, 41]].tolist() == sure
+    for names in (("0",), ("0", "3")):  # a single camera, and one without hand detection
         capture.train_cameras = names
         assert observe_hands(capture) is None
 

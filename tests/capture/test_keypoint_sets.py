@@ -208,7 +208,7 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
     sure = points(17)
     sure[:, 2] = 3
     results = [
-        {"image_id": "000002.jpg", "category_id": 1, "keypoints": points(17).ravel().tolist(), "score": 2.9},
+        {"image_id": "000000000002.jpg", "category_id": 1, "keypoints": points(17).ravel().tolist(), "score": 2.9},
         {"image_id": 4, "category_id": 1, "keypoints": points(17).ravel().tolist(), "score": 1.0},
         {"image_id": 4, "category_id": 1, "keypoints": sure.ravel().tolist(), "score": 0.5},
     ]

@@ -51,13 +51,14 @@ def person(points_px: np.ndarray, angle: float) -> Person:
 
 
 def test_heatmaps_by_hand() -> None:
-    """A Gaussian around column 2.3, row 4.8 of 12 x 9 cells, and one in a corner. An input of 45 x 34 px has 4 px per
+    """A Gaussian around column 2.3, row 4.8 of 12 x 9 cells, and one above 1 in a corner. An input of 45 x 34 px has 4 px per
     cell."""
     y, x = np.mgrid[:12, :9]
-    maps = np.stack([0.8 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 4.5) for a, b in ((2.3, 4.8), (8, 0))])
+    places = ((2.3, 4.8, 0.8), (8, 0, 1.2))
+    maps = np.stack([peak * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 4.5) for a, b, peak in places])
     found = from_heatmaps(maps, (33, 45))
     np.testing.assert_allclose(found[:, :2], [[4 * 2.3, 4 * 4.8], [32, 0]], atol=1e-9)
-    np.testing.assert_allclose(found[:, 2], [0.8 * math.exp(-(0.3**2 + 0.2**2) / 4.5), 0.8])
+    np.testing.assert_allclose(found[:, 2], [0.8 * math.exp(-(0.3**2 + 0.2**2) / 4.5), 1])
     assert np.array_equal(from_heatmaps(np.zeros((1, 12, 9)), (33, 45)), [[0, 0, 0]])
 
 

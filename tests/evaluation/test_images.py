@@ -22,11 +22,15 @@ def test_renderings_are_rgba_with_colour_over_black(tmp_path: Path) -> None:
     assert picture.tolist() == [[[128, 0, 0, 128], [0, 0, 0, 255]]]
     write_image(tmp_path / "a.png", picture)
     assert np.array_equal(read_rgba(tmp_path / "a.png"), picture)
-    with pytest.raises(RuntimeError, match="not finite"):
-        rgba(Rendering(torch.full((1, 2, 3), torch.nan), alpha, alpha))
     assert np.array_equal(read_rgb(tmp_path / "a.png"), picture[..., :3])
     stored = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert stored is not None and stored[0, 0].tolist() == [0, 0, 128, 128]  # BGRA
+
+
+def test_a_rendering_with_nan_is_not_scored_as_black() -> None:
+    alpha = torch.ones(1, 2)
+    with pytest.raises(InputError, match=r"renders NaN; train it with another training\.seed"):
+        rgba(Rendering(torch.full((1, 2, 3), torch.nan), alpha, alpha))
 
 
 def test_means_skip_unknown_values_but_include_zeros() -> None:

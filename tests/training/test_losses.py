@@ -86,6 +86,8 @@ def test_geometry_with_the_roles_in_the_published_formula():
     """Densities are labels for the predictions 0.2, 0.9 and 0.1; samples outside the box are ignored."""
     expected = cross_entropies((0.2, 0.9, 0.1), LABELS)
     assert losses.geometry(COUPLED, 50.0, 0.1, 80.0, "print").item() == pytest.approx(expected, rel=1e-5)
+    nearer = replace(COUPLED, d=0.4 * COUPLED.d)  # as sharp, with gamma 200
+    assert losses.geometry(nearer, 50.0, 0.1, 200.0, "print").item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_geometry_with_the_surface_as_labels():

@@ -19,6 +19,7 @@ PSNR, CHAMFER = "psnr", "geometry.chamfer_l2_e3"
 FIGURES = {PSNR: ("{} dB", 1, 1), CHAMFER: ("Chamfer {}", 3, -1)}
 # What a different seed may cost: decibels, and a factor on the squared distance (docs/findings.md).
 SEED_DB, SEED_RATIO = 0.4, 1.1
+NOTHING = {PSNR: "no images", CHAMFER: "no surface"}
 WEAK = 0.5  # absolute correlation below which there is no trend
 NO_SURFACE = 0.1  # IoU below which a mesh does not count as the person's surface
 
@@ -38,15 +39,18 @@ def claim_lines(result: Result) -> list[str]:
 
 def more_is_better(result: Result) -> Iterator[Finding]:
     """Check, for every method, that scores are better with the most cameras or frames than with the fewest, and never
-    drop between consecutive values by more than seed noise. Where a method has no score but another has, the claim is
-    not supported."""
+    drop between consecutive values by more than seed noise. A method that fails does not support the claim, unless it
+    fails with few cameras or frames and works with more."""
+    methods = {name: None for variant in result["variants"].values() for name in variant["methods"]}
     for key, (_, _, sign) in FIGURES.items():
         curves = sweep_curves(result, key)
-        counts = {count for curve in curves.values() for count, _ in curve}
-        for name, curve in curves.items():
-            values = [value for _, value in curve]
-            for count in sorted(counts - dict(curve).keys()):
-                yield False, f"{count:g} {result['sweep']}: {name} nothing"
+        counts = sorted({count for curve in curves.values() for count, _ in curve})
+        for name in methods:
+            curve = dict(curves.get(name, []))
+            values = list(curve.values())
+            for count in counts:
+                if count not in curve and count > min(curve, default=0):
+                    yield False, f"{count:g} {result['sweep']}: {name} {NOTHING[key]}"
             if len(values) > 1:
                 falls = any(_falls(key, *step) for step in itertools.pairwise(values))
                 yield sign * (values[-1] - values[0]) > 0 and not falls, f"{name} {_shown(key, *values)}"

@@ -135,7 +135,7 @@ def test_the_ground_is_put_below_the_feet_in_any_world() -> None:
     stood, _ = stand_on_ground(cameras, walk_m() @ tumble.T + [1, 2, 3], 1 / 30)
     assert stood[0].centre_m[0] == pytest.approx(0, abs=1e-9) and stood[0].centre_m[1] < 0
     heights_m = [camera.centre_m[2] + 0.02 for camera in stood]  # the toes are 2 cm above the floor
-    assert heights_m == pytest.approx([camera.centre_m[2] for camera in ring(4)], abs=0.02)
+    assert heights_m == pytest.approx([camera.centre_m[2] for camera in ring(4)], abs=1e-6)
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 90.0, -90.0])

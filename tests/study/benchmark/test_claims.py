@@ -70,11 +70,16 @@ def test_more_is_better_at_every_step(psnr: tuple[float, ...], chamfer: tuple[fl
 
 
 def test_more_is_not_better_for_a_method_that_fails_with_more() -> None:
-    """nerf fails with eight cameras."""
-    result = without_fast("more_is_better", 8)
-    methods = result["variants"]["8 cameras"]["methods"]
-    methods["fast"], methods["nerf"] = of_method(30.5, 0.08, 0.9, 8, 0.1), methods["fast"]
-    assert verdict(result).startswith("no: fast 28.0, 30.0, 30.5 dB; 8 cameras: nerf nothing; nerf 20.0, 26.0 dB; fast")
+    """fast fails with eight cameras, with all, and with the fewest alone, where more do help."""
+    assert verdict(without_fast("more_is_better", 8)) == (
+        "no: 8 cameras: fast no images; fast 28.0, 30.0 dB; nerf 20.0, 26.0, 26.2 dB; "
+        "8 cameras: fast no surface; fast Chamfer 0.200, 0.100; nerf Chamfer 0.900, 0.500, 0.490."
+    )
+    nowhere = without_fast("more_is_better", 8)
+    for variant in nowhere["variants"].values():
+        variant["methods"]["fast"] = {"error": "no surface"}
+    assert verdict(nowhere).startswith("no: 2 cameras: fast no images; 4 cameras: fast no images; 8 cameras: fast no")
+    assert verdict(without_fast("more_is_better", 2)).startswith("yes: fast 30.0, 30.5 dB; nerf 20.0, 26.0, 26.2 dB")
 
 
 @pytest.mark.parametrize("check", ["more_is_better", "loses_least"])
