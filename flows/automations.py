@@ -7,7 +7,7 @@ has set up.
 import argparse
 from collections.abc import Iterator
 from datetime import timedelta
-from typing import cast
+from typing import Any, cast
 from uuid import UUID
 
 import httpx
@@ -55,28 +55,47 @@ def lost_runs(silence_s: int) -> AutomationCore:
 def notices(block: UUID, pool: str) -> Iterator[AutomationCore]:
     """Yield the automations that call a webhook, with a JSON object whose `text` is one line."""
     run = "flow.name ~ ' ' ~ flow_run.name ~ ' is ' ~ flow_run.state.name ~ ': ' ~ (flow_run.state.message or '')"
-    late = "flow.name ~ ' ' ~ flow_run.name ~ ' is late: no worker takes it'"
-    full = "'store ' ~ event.resource.name ~ ': ' ~ event.payload.free_gib ~ ' GiB are free; nothing is started'"
     ended = {f"prefect.flow-run.{state}" for state in ("Failed", "Crashed", "TimedOut")}
-    watched = {"prefect.resource.id": "prefect.work-pool.*", "prefect.resource.name": pool}
-    stores = {"prefect.resource.id": "hnerf.store.*"}
-    for name, what, match, related, expect, text in (
-        ("failed runs", "A run failed, crashed or took too long.", RUNS, {}, ended, run),
-        ("late runs", "A scan waits for a worker.", RUNS, SCANS, {"prefect.flow-run.Late"}, late),
-        ("no worker", "The work pool has no worker any more.", watched, {}, {"prefect.work-pool.not-ready"},
-         f"'work pool {pool} has no worker'"),
-        ("disk nearly full", "Nothing more is started for lack of space.", stores, {}, {DISK_EVENT}, full),
-    ):  # fmt: skip
-        trigger = EventTrigger(
-            match=match,  # type: ignore[arg-type]
-            match_related=related,  # type: ignore[arg-type]
-            for_each={"prefect.resource.id"},
-            expect=expect,
-            posture=Posture.Reactive,
-        )
-        payload = '{"text": {{ (' + text + ") | tojson }}}"
-        call = CallWebhook(block_document_id=block, payload=payload)
-        yield AutomationCore(name=f"hnerf: {name}", description=what, trigger=trigger, actions=[call])
+    yield _notice("failed runs", "A run failed, crashed or took too long.", RUNS, ended, run, block)
+    late = "flow.name ~ ' ' ~ flow_run.name ~ ' is late: no worker takes it'"
+    yield _notice("late runs", "A scan waits for a worker.", RUNS, {"prefect.flow-run.Late"}, late, block, SCANS)
+    yield _notice(
+        "no worker",
+        "The work pool has no worker any more.",
+        {"prefect.resource.id": "prefect.work-pool.*", "prefect.resource.name": pool},
+        {"prefect.work-pool.not-ready"},
+        f"'work pool {pool} has no worker'",
+        block,
+    )
+    yield _notice(
+        "disk nearly full",
+        "Nothing more is started for lack of space.",
+        {"prefect.resource.id": "hnerf.store.*"},
+        {DISK_EVENT},
+        "'store ' ~ event.resource.name ~ ': ' ~ event.payload.free_gib ~ ' GiB are free; nothing is started'",
+        block,
+    )
+
+
+def _notice(
+    name: str,
+    what: str,
+    match: dict[str, Any],
+    expect: set[str],
+    text: str,
+    block: UUID,
+    related: dict[str, Any] | None = None,
+) -> AutomationCore:
+    trigger = EventTrigger(
+        match=match,  # type: ignore[arg-type]
+        match_related=related or {},  # type: ignore[arg-type]
+        for_each={"prefect.resource.id"},
+        expect=expect,
+        posture=Posture.Reactive,
+    )
+    payload = '{"text": {{ (' + text + ") | tojson }}}"
+    call = CallWebhook(block_document_id=block, payload=payload)
+    return AutomationCore(name=f"hnerf: {name}", description=what, trigger=trigger, actions=[call])
 
 
 def set_up(webhook: str | None, pool: str, silence_s: int) -> list[str]:
