@@ -44,6 +44,7 @@ log = logging.getLogger("hnerf.store")
 
 RECORDING = ".recording"  # under subjects/<name>: digest and folder of the recording
 SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving", ".old", ".shared")  # a key may have, besides its lock
+MAX_LINKS = 40  # one after another, as for the kernel
 MAX_RECORD_BYTES = 256_000_000  # a million files need half of this
 ATTEMPTS = 100  # to lock a key in a folder that other processes create and remove
 # In order: each stage is computed from those before it.
@@ -374,7 +375,11 @@ def recording_digest(subject: Path) -> str:
 def _linked(link: Path) -> Path:
     """Return the place in the store to which a subject's link leads; the folder of its stage may be a link to another
     disk, which is not followed."""
-    return Path(os.path.normpath(link.parent.resolve() / os.readlink(link))) if link.is_symlink() else link
+    place = link.parent.resolve() / link.name
+    for _ in range(MAX_LINKS):
+        if place.is_symlink():
+            place = Path(os.path.normpath(place.parent / os.readlink(place)))
+    return place
 
 
 def sha256_of(path: Path) -> str:

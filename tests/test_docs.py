@@ -53,7 +53,8 @@ def test_answers_to_where_is_name_existing_code() -> None:
 
 def test_every_package_has_an_api_page() -> None:
     nav = (ROOT / "mkdocs.yml").read_text()
-    for path in (ROOT / "hnerf").glob("*/__init__.py"):  # docs/hooks.py writes the pages
+    assert "::: hnerf.{package}" in (ROOT / "docs" / "hooks.py").read_text()  # which writes the pages
+    for path in (ROOT / "hnerf").glob("*/__init__.py"):
         assert f"api/{path.parent.name}.md" in nav
 
 

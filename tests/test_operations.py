@@ -7,14 +7,16 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 
-from tests.prefect_server import free_port, wait_for
+from tests.prefect_server import free_port
 from tests.shared_data import SHARED_DATA as SHARED
 
 ROOT = Path(__file__).parents[1]
@@ -38,7 +40,7 @@ evaluation: {max_images: 1, max_meshes: 1, report_rows: 1}
 asset: {grid_cells: 48, faces: 1500, texture_px: 64, texture_poses: 1, photograph_frames: 1, correctives: 0}
 """
 SIZES = {"size_px": 96, "train_cameras": 5, "test_cameras": 0, "train_frames": 4, "novel_pose_frames": 1}
-PATIENCE_S, START_S = 3600.0, 300.0  # for a command to end, and for the server to answer
+PATIENCE_S = 3600.0
 
 
 def commands() -> list[str]:
@@ -130,8 +132,14 @@ def start(command: str, folder: Path, variables: dict[str, str]) -> "subprocess.
     # Prefect's worker ends on SIGINT, which is ignored if the tests run as a shell's background job.
     listens = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     started = subprocess.Popen(shlex.split(command), cwd=folder, env=variables, preexec_fn=listens)
-    wait_for(f"{variables['PREFECT_API_URL']}/health", START_S)
-    return started
+    deadline_s = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            httpx.get(f"{variables['PREFECT_API_URL']}/health", timeout=2).raise_for_status()
+            return started
+        except httpx.HTTPError:
+            assert started.poll() is None and time.monotonic() < deadline_s
+            time.sleep(1)
 
 
 def executable(names: dict[str, str]) -> Iterator[str]:

@@ -10,6 +10,7 @@ import torch
 
 from hnerf.avatar.avatar import Avatar, Rendering
 from hnerf.capture.capture import Capture, read_rgba, write_image
+from hnerf.errors import InputError
 from hnerf.evaluation import metrics
 from hnerf.evaluation.ground_truth import Truth
 from hnerf.evaluation.views import NOVEL_POSE_SPLITS, View, all_views, sample_views

@@ -51,8 +51,8 @@ def person(points_px: np.ndarray, angle: float) -> Person:
 
 
 def test_heatmaps_by_hand() -> None:
-    """A Gaussian around column 2.3, row 4.8 of 12 x 9 cells, and one above 1 in a corner. An input of 45 x 34 px has 4 px per
-    cell."""
+    """A Gaussian around column 2.3, row 4.8 of 12 x 9 cells, and one above 1 in a corner. An input of 45 x 34 px has
+    4 px per cell."""
     y, x = np.mgrid[:12, :9]
     places = ((2.3, 4.8, 0.8), (8, 0, 1.2))
     maps = np.stack([peak * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 4.5) for a, b, peak in places])

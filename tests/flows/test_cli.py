@@ -43,7 +43,10 @@ from tests.shared_data import shared_capture
         ("export . --blender absent", "absent: no such program; give --blender Blender 4.5 or newer, or a"),
         ("render . --motion a.npz", "a.npz: no such file; give a BVH file, an AMASS .npz, another"),
         ("export . --set asset.bones=up", "hnerf: --set asset.bones=up: asset.bones: Input should be 'along'"),
-        ("export . --set training.steps=3", "this command takes settings of the section `asset` only; remove it"),
+        (
+            "export . --set training.steps=3",
+            "hnerf: --set training.steps=3: this command takes settings of the section `asset`",
+        ),
         ("synchronise . --set asset.bones=up", "this command takes settings of the section `limits` only; remove it"),
         ("run http://example.com/x.mp4", "http://example.com/x.mp4: is no bucket; download it and give the file"),
         ("run s3://", "hnerf: s3://: names no bucket; give a URL like s3://bucket/folder"),

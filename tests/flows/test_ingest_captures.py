@@ -470,7 +470,7 @@ def test_captures_in_a_bucket_are_started_by_their_url(bucket: str, tmp_path: Pa
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada"]
 
 
-def test_a_capture_moved_within_the_bucket_isstarted_from_its_new_url(bucket: str, tmp_path: Path) -> None:
+def test_a_capture_moved_within_the_bucket_is_started_from_its_new_url(bucket: str, tmp_path: Path) -> None:
     store = tmp_path / "store"
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
     filesystem("s3").mv(f"{bucket}/ada/a.mp4", f"{bucket}/adele/a.mp4")

@@ -1,3 +1,4 @@
+import errno
 import json
 import logging
 import shutil
@@ -14,7 +15,7 @@ from hnerf.errors import InputError
 from tasks.bucket import VARIABLE
 from tasks.policy import LOGGERS
 from tasks.source import Source, read_capture
-from tasks.stage import Stage, image_count, stage
+from tasks.stage import RETRIES, Stage, image_count, retried, stage
 from tasks.store import Artifact, Store
 
 
@@ -211,6 +212,22 @@ def test_only_transient_errors_are_retried(
     else:
         flow_with_flaky_stage(tmp_path, read_capture(source.root)[0])
     assert calls(tmp_path) == attempts * ["flaky"]
+
+
+def test_reading_a_recording_is_retried_in_a_flow_run(prefect_api: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(RETRIES, "retry_delay_seconds", 0)
+    tried = []
+
+    def read(folder: str) -> str:
+        tried.append(folder)
+        if len(tried) < 3:
+            raise OSError(errno.ESTALE, "Stale file handle")
+        return folder
+
+    assert flow(lambda: retried(read)("ada"), name="reading")() == "ada" and len(tried) == 3
+    tried.clear()
+    with pytest.raises(OSError, match="Stale"):
+        retried(read)("ada")
 
 
 def test_a_refusal_is_logged_without_a_traceback(

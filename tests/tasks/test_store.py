@@ -448,15 +448,20 @@ def test_a_subject_whose_stage_is_on_another_disk_is_found_in_its_store(tmp_path
     (tmp_path / "store").mkdir()
     (tmp_path / "store" / "hands").symlink_to(tmp_path / "disk")
     made = store.link_latest("ada", store.get_or_compute("hands", "k", write_abc))
-    require_intact(subject)
-    assert recording_digest(subject) == made.digest
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "hands").symlink_to(subject / "hands")
+    (tmp_path / "home").symlink_to(subject)
+    for folder in (subject, tmp_path / "mine", tmp_path / "home"):
+        require_intact(folder)
+        assert recording_digest(folder) == made.digest
 
 
-def test_the_digest_of_the_recording_is_that_of_its_last_stage(tmp_path: Path) -> None:
+def test_the_digest_of_the_recording_is_that_of_its_last_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store, folder = Store(tmp_path), tmp_path / "subjects" / "ada"
     assert recording_digest(folder) == ""
     for stage in ("capture", "hands"):
         made = store.link_latest("ada", store.get_or_compute(stage, "k", write_abc))
         assert recording_digest(folder) == made.digest
     (tmp_path / "copied" / "capture").mkdir(parents=True)
-    assert recording_digest(tmp_path / "copied") == ""
+    monkeypatch.chdir(tmp_path / "copied")
+    assert recording_digest(Path(".")) == ""
