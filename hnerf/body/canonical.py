@@ -131,7 +131,7 @@ class PosedBodies:
     ) -> Descriptor:  # fmt: skip
         """Return descriptors of world points (N, 3) relative to the bodies of rows `frame` (N,); gradients flow to the
         points and the correction. Those of s and y take the skin around the closest point for rigid
-        (docs/method.md, "Body descriptor")."""
+        (docs/method.md, "The body prior")."""
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
         return self._described(points_m, frame, found, correction)
 
