@@ -9,6 +9,7 @@
 <store>/ingested/id               random, so that the same key in another ledger is another run
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
@@ -54,8 +55,9 @@ class Ledger:
         """Remove notes about listings that nobody asked for lately: their folders have changed since."""
         stale_s = now_s(self.root) - STALE_S
         for path in (*self.root.glob("new-*"), *self.root.glob("refused-*")):
-            if path.stat().st_mtime < stale_s:
-                path.unlink()
+            with suppress(FileNotFoundError):  # another machine's scan may have removed it
+                if path.stat().st_mtime < stale_s:
+                    path.unlink()
 
     def note_seen(self, listing: str, digest: str) -> None:
         """Note the content of a folder with this listing."""

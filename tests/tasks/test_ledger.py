@@ -75,6 +75,25 @@ def test_notes_about_listings_that_have_changed_since_are_removed(tmp_path: Path
     assert {path.name for path in ledger.root.iterdir()} == left
 
 
+def test_a_note_that_another_scan_removes_meanwhile_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ledger = Ledger.of(tmp_path)
+    for name in ("new-ada", "refused-ada", "new-bob"):
+        (ledger.root / name).write_text("")
+        os.utime(ledger.root / name, (0, 0))
+    unlink = Path.unlink
+
+    def after_another(path: Path) -> None:
+        if path.name == "new-ada":
+            unlink(ledger.root / "refused-ada")
+        unlink(path)
+
+    monkeypatch.setattr(Path, "unlink", after_another)
+    ledger.sweep()
+    assert not list(ledger.root.iterdir())
+
+
 @pytest.mark.usefixtures("wrong_clock")
 def test_the_age_of_a_listing_does_not_depend_on_this_machines_clock(tmp_path: Path) -> None:
     """The ledger may be on a share, whose server dates the files."""
