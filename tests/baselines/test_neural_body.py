@@ -15,11 +15,11 @@ from tests.baselines.column import learn, three_poses
 SMALL = [
     "training.steps=95",
     "training.rays_per_frame=96",
-    "training.field.voxel_m=0.0613",  # not commensurate with the column's edges, so no vertex lies between voxels
+    "training.field.voxel_m=0.0813",  # not commensurate with the column's edges, so no vertex lies between voxels
     "training.field.samples=16",
     "training.field.channels=8",
     "training.field.width=32",
-    "training.field.learning_rate=0.01",
+    "training.field.learning_rate=0.02",
 ]
 DOWN = torch.tensor([[0.5, 0.5, 5.0], [0.4, 0.6, 5.0]]), torch.tensor([[0.0, 0.0, -1.0]]).expand(2, 3)
 

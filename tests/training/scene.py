@@ -77,7 +77,7 @@ def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
 
 def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tuple[Capture, Masks, BodyFit]:
     """Write the recording to `folder`, with the column bent by these angles in its frames; frame 2 is a novel pose."""
-    rig = box_rig(bend_segments=6, splits=4)
+    rig = box_rig(bend_segments=6, splits=2)
     theta = torch.zeros(len(FRAMES), 2, 3)
     theta[:, 1, 1] = torch.tensor(bends_rad)
     body = BodyFit(rig, FRAMES, theta, torch.eye(4).repeat(len(FRAMES), 1, 1))
