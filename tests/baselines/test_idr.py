@@ -12,11 +12,11 @@ from hnerf.fields.rays import Rays
 from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
 
 SMALL = [
-    "training.steps=150",
-    "training.rays_per_frame=128",
+    "training.steps=110",
+    "training.rays_per_frame=64",
     "training.field.width=32",
-    "training.field.samples=16",
-    "training.field.learning_rate=0.003",
+    "training.field.samples=8",
+    "training.field.learning_rate=0.004",
 ]
 AXES = torch.cat([torch.eye(3), -torch.eye(3)])
 

@@ -21,11 +21,11 @@ from hnerf.training.losses import Target, blend, colour_errors
 from tests.baselines.ball import RING, body, inner_psnr, psnr, record, trained
 
 SMALL = [
-    "training.steps=200",
+    "training.steps=150",
     "training.rays_per_frame=96",
     "training.field.width=32",
-    "training.field.samples=16",
-    "training.field.learning_rate=0.015",
+    "training.field.samples=10",
+    "training.field.learning_rate=0.02",
 ]
 
 

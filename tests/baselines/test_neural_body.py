@@ -15,7 +15,7 @@ from tests.baselines.column import learn, three_poses
 SMALL = [
     "training.steps=95",
     "training.rays_per_frame=96",
-    "training.field.voxel_m=0.0813",  # not commensurate with the column's edges, so no vertex lies between voxels
+    "training.field.voxel_m=0.0713",  # not commensurate with the column's edges, so no vertex lies between voxels
     "training.field.samples=16",
     "training.field.channels=8",
     "training.field.width=32",

@@ -79,12 +79,12 @@ def test_a_field_can_overfit_the_column(tmp_path: Path):
     """After a few seconds of training, a rendered training view has more than 40 dB and the right depth. Outlines are
     left out, because those of the photograph are not antialiased."""
     capture, masks, body = record(tmp_path / "capture")
-    rates = {"network_learning_rate": 0.02, "grid_learning_rate": 0.05}
+    rates = {"network_learning_rate": 0.03, "grid_learning_rate": 0.07}
     fast = TINY.field.model_dump() | rates | {"spacing_m": 0.015, "outer_m": 0.1}
     out = tmp_path / "out"
     out.mkdir()
-    rare = {"absorb_steps": 60, "checkpoint_steps": 120}
-    train(capture, masks, body, tiny(field=fast, steps=120, rays_per_frame=256, **rare), out, ALONE)
+    rare = {"absorb_steps": 40, "checkpoint_steps": 80}
+    train(capture, masks, body, tiny(field=fast, steps=80, rays_per_frame=128, **rare), out, ALONE)
     avatar = load_avatar(out, "cpu")
     drawn = avatar.render(capture.cameras["0"], avatar.body.theta[0], avatar.body.root[0])
     mask = torch.from_numpy(masks.get("0", 0))
