@@ -1,6 +1,6 @@
 """The stages before training, which `train-subject` and the studies have in common."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from shutil import which
 from typing import NamedTuple
 
@@ -76,10 +76,16 @@ def prepare_training(store: Store, recording: Artifact, settings: Settings) -> P
     return segment_and_fit(store, recording, calibrate(store, recording, settings.calibration), settings)
 
 
-def segment_and_fit(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Prepared:
-    """Run the stages between calibration and training."""
-    segmentation = segment_subject(store, recording, calibration, settings)
-    body = fit(store, recording, calibration, segmentation, settings.fit)
+def segment_and_fit(
+    store: Store,
+    recording: Artifact,
+    calibration: Artifact,
+    settings: Settings,
+    link: Callable[[Artifact], Artifact] = lambda made: made,
+) -> Prepared:
+    """Run the stages between calibration and training. link: called with each result as soon as it is there."""
+    segmentation = link(segment_subject(store, recording, calibration, settings))
+    body = link(fit(store, recording, calibration, segmentation, settings.fit))
     return Prepared(recording, calibration, segmentation, body)
 
 

@@ -11,7 +11,7 @@ from prefect import flow
 from prefect.client.schemas.objects import FlowRun, State
 
 from flows.arguments import StoreFolder
-from flows.preparation import Prepared, missing_cameras, segment_and_fit, segment_subject, with_detections
+from flows.preparation import missing_cameras, segment_and_fit, with_detections
 from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
@@ -23,7 +23,6 @@ from tasks.asset import export
 from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate, evaluate_held_out
-from tasks.fit import fit
 from tasks.ledger import forget, release
 from tasks.limits import StalledError, set_limits
 from tasks.policy import EXPECTED, is_of_the_machine
@@ -84,20 +83,15 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     link = partial(artifact_store.link_latest, subject)
     calibration = link(calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
-    segmentation = link(segment_subject(artifact_store, recording, calibration, settings))
-    body = link(fit(artifact_store, recording, calibration, segmentation, settings.fit))
-    prepared = Prepared(recording, calibration, segmentation, body)
+    prepared = segment_and_fit(artifact_store, recording, calibration, settings, link)
     training = link(train(artifact_store, *prepared, settings.training))
-    held_out = tuple(
-        evaluate_without_camera(camera, artifact_store, recording, calibration, segmentation, settings)
-        for camera in left_out
-    )
+    held_out = tuple(evaluate_without_camera(camera, artifact_store, *prepared[:3], settings) for camera in left_out)
     evaluation = link(evaluate(artifact_store, truth, *prepared, training, settings.evaluation, held_out))
     results, asset = [*made, *prepared[1:], training, evaluation], None
     if reason := reason_without_novel_poses(training.root):
         log.warning("no asset: %s", reason)
     else:
-        results.append(export(artifact_store, recording, calibration, segmentation, training, settings.asset))
+        results.append(export(artifact_store, *prepared[:3], training, settings.asset))
         asset = results[-1].root / "avatar.usdz"
     # Again: another run of this name may have relinked them.
     artifact_store.unlink_latest(subject, skipped)
