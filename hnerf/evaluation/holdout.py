@@ -15,7 +15,8 @@ from hnerf.config import EvaluationSettings
 from hnerf.errors import InputError
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.ground_truth import OwnMasks
-from hnerf.evaluation.images import mean_of, render, score_split, scored_views, unscored
+from hnerf.evaluation.images import MEANS, mean_of, render, score_split, scored_views, unscored
+from hnerf.evaluation.report import FIGURES
 from hnerf.evaluation.views import PRIMARY_SPLITS
 from hnerf.results.files import write_result
 from hnerf.results.scores import HeldOutCamera
@@ -23,7 +24,6 @@ from hnerf.results.scores import HeldOutCamera
 EACH = "each"
 MIN_CAMERAS = 2  # that must remain for training
 SCORES_FILE = "holdout.json"
-FIGURES = ("psnr", "ssim", "mask_iou", "lpips")
 LABEL = "photographs under the capture's own masks, camera left out of fit and training"
 NOT_REQUESTED = (
     "no field was trained without a camera; `hnerf run --set evaluation.holdout=each` trains one without each in turn"
@@ -83,7 +83,6 @@ def collect_held_out(capture: Capture, folders: Sequence[Path]) -> dict[str, Any
         reason = "the capture has test cameras, which score it" if capture.test_cameras else NOT_REQUESTED
         return {"holdout": None, "holdout_reason": reason}
     cameras = {found.pop("camera"): found for found in (json.loads((f / SCORES_FILE).read_text()) for f in folders)}
-    mean = {
-        split: {key: mean_of([c[split][key] for c in cameras.values()]) for key in FIGURES} for split in PRIMARY_SPLITS
-    }
+    keys = [key for key, *_ in FIGURES if key in MEANS]
+    mean = {split: {k: mean_of([c[split][k] for c in cameras.values()]) for k in keys} for split in PRIMARY_SPLITS}
     return {"holdout": {"what": LABEL, "cameras": cameras, "mean": mean}}
