@@ -38,7 +38,8 @@ class Avatar:
     """A trained person: a field, and the body under the clothes, with its poses. learned: poses of the frames that the
     field knows, whatever body and poses are shown.
 
-    theta (J, 3) in radians and root (4, 4), world from body, set the pose, which need not be one of `body`.
+    theta (J, 3) in radians and root (4, 4), world from body, set the pose, which need not be one of `body`. All tensors
+    that methods take are float32, on the device of `body`, and have one pose; cameras are in numpy.
     """
 
     field: Field
