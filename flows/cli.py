@@ -301,7 +301,7 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     _add_study(benchmark, "dynamic", "benchmark", "a GPU")
     what = "presets or YAML files to compare, like fast,nerf (default: the study's)"
     benchmark.add_argument("--methods", type=_names, metavar="LIST", help=what)
-    what = "time limit of each training (default: the study's)"
+    what = "time limit of each training, without its tuning of new poses (default: the study's)"
     benchmark.add_argument("--seconds", type=number(float, 0.1, 1_000_000), metavar="S", help=what)
 
 
