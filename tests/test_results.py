@@ -2,17 +2,17 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from pydantic import ValidationError
 
 from hnerf.results.__main__ import main
 from hnerf.results.files import FILES, write_result, write_schemas
-from hnerf.results.scores import HeldOutCamera
+from hnerf.results.scores import HeldOutCamera, Mean
 
 SCHEMAS = Path(__file__).parent.parent / "docs" / "schemas"
-MEANS: dict[str, Any] = dict.fromkeys(["psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr"])
+MEANS: dict[str, Any] = dict.fromkeys(get_args(Mean))
 NONE = {"n": 0, "per_image": []} | MEANS | {"reason": "no test camera"}
 SCORES = {"camera": "a", "trained_on": ["b"], "novel_view": NONE, "novel_pose": NONE}
 

@@ -197,6 +197,8 @@ def test_stages_that_a_run_skips_are_not_linked(folder: Path, tmp_path: Path) ->
 
 def test_the_store_knows_every_stage_that_a_subject_links_to() -> None:
     flow = vars(preparation) | vars(module)
+    unlinked = {"subset", "holdout"}
+    assert {one.name for one in flow.values() if isinstance(one, Stage)} - unlinked == set(store.STAGES)
     assert [flow[name].name for name in STAGES] == list(store.STAGES)
 
 
