@@ -96,6 +96,14 @@ def test_each_loss_gets_its_own_inputs_and_weight() -> None:
     )
 
 
+def test_every_weight_has_a_loss() -> None:
+    constants = {"eta", "density_threshold", "density_steepness", "geometry_roles"}
+    weights = LossSettings.model_fields.keys() - constants
+    settings = TrainingSettings(field=PaperFieldSettings(), losses=LossSettings(**dict.fromkeys(weights, 1)))
+    samples = dataclasses.replace(SAMPLES, in_box=torch.ones(2, 2))
+    assert objective_terms(settings, samples, torch.ones(2, 2), axis=2).keys() == weights
+
+
 def test_the_floor_loss_covers_samples_below_the_ground() -> None:
     """The second sample of the first ray is 10 cm below the ground, and its d_hat is -0.02: a mean of 0.01 over two
     rays, times 3, and times 2.5 for a field whose distances are in units of 2.5 m. If the ground is unknown, there is
