@@ -7,7 +7,7 @@ from hnerf.calibration.clocks.recording import UndeterminedClocksError, synchron
 from hnerf.calibration.person.recording import calibrate_recording
 from hnerf.capture.clocks import FILE, RATE_TOLERANCE, Clock, read_clocks, write_clocks
 from hnerf.capture.ingest import check_world_of_person
-from hnerf.capture.manifest import chosen_cameras, read_manifest
+from hnerf.capture.manifest import read_manifest
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration, image_folders_in
 from hnerf.errors import InputError
 
@@ -22,9 +22,8 @@ def find_missing_cameras(folder: Path, out: Path) -> None:
     folder states are used. Raises InputError if the recording does not determine the rest or, before any work, if
     `capture.toml` says what ingestion would refuse afterwards.
     """
-    manifest = read_manifest(folder)
-    check_world_of_person(folder, manifest)
-    chosen_cameras(folder, manifest, cameras_without_calibration(folder), [], "the folder")
+    check_world_of_person(folder, read_manifest(folder))
+    cameras_without_calibration(folder)  # refuses names that are not there
     log.warning("%s: no calibration (extri.yml or another): finding cameras from the person takes minutes", folder)
     clocks = read_clocks(folder)
     if not clocks and not image_folders_in(folder):

@@ -14,7 +14,7 @@ from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.pose2sim import lens_from_table
 from hnerf.capture.lens import Lens, by_name
-from hnerf.capture.manifest import read_manifest
+from hnerf.capture.manifest import chosen_cameras, read_manifest
 from hnerf.capture.safe_io import (
     VIDEO_SUFFIXES,
     by_camera,
@@ -40,13 +40,15 @@ class KnownLens(NamedTuple):
 def cameras_without_calibration(folder: Path) -> list[str]:
     """Return the cameras of a folder without camera poses: one for each folder in images/, else for each video in
     videos/, else for each video in the folder itself; of these, the ones that `capture.toml` names, if it names any.
-    Possibly none."""
+    Possibly none. Raises InputError if it names others."""
     if folders := image_folders_in(folder):
         names = [check_camera_name(path.name, path) for path in folders]
     else:
         names = list(by_camera(videos_in(folder)))
-    split = read_manifest(folder).cameras
-    return names if split is None else [name for name in names if name in split.train + split.test]
+    if not names:
+        return []
+    split = chosen_cameras(folder, read_manifest(folder), names, [], "the folder")
+    return [name for name in names if name in split.train + split.test]
 
 
 def image_folders_in(folder: Path) -> list[Path]:

@@ -264,3 +264,12 @@ def test_only_the_cameras_that_are_named_are_used(tmp_path: Path) -> None:
         write_images(tmp_path, camera)
     (tmp_path / "capture.toml").write_text('[cameras]\ntrain = ["a"]\ntest = ["c"]\n')
     assert cameras_without_calibration(tmp_path) == ["a", "c"]
+
+
+def test_a_named_camera_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    """Otherwise the recording would be read without it, or refused for want of cameras."""
+    for camera in "abc":
+        write_images(tmp_path, camera)
+    (tmp_path / "capture.toml").write_text('[cameras]\ntrain = ["a", "b", "C"]\n')
+    with pytest.raises(InputError, match=r"capture\.toml: camera C is not in the folder; correct \[cameras\]"):
+        cameras_without_calibration(tmp_path)
