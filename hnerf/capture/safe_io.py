@@ -20,6 +20,7 @@ from hnerf.errors import InputError, one_line, raise_if_unreachable
 
 MAX_IMAGE_PIXELS = 36_000_000  # a frame of 8K video has 33 million
 MAX_SIDE_PX = 32_766  # of images that OpenCV can undistort
+MAX_IMAGE_BYTES = 256_000_000  # more than those pixels take uncompressed; anything may follow an image in its file
 MAX_TEXT_BYTES = 16_000_000
 MAX_TOML_BYTES = 500_000
 MAX_KEY_PARTS = 16  # of a dotted key in TOML; tomllib's memory and time grow with their square
@@ -265,6 +266,8 @@ def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.
     image: Image.Image  # one at a time: each conversion is another copy
     try:
         with Image.open(path, formats=["JPEG", "PNG"]) as image:
+            if (size_bytes := path.stat().st_size) > MAX_IMAGE_BYTES:
+                raise InputError(f"{path}: {size_bytes} bytes are too many for an image; export it again")
             check_image_size(path, *image.size)
             if image.mode not in _IMAGE_MODES:
                 raise InputError(f"{path}: pixels are {image.mode}; export it again as RGB or grey, 8 bits a channel")

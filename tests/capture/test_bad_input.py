@@ -129,6 +129,10 @@ EASYMOCAP = {
         "images/02: all pictures are black",
     ),
     "image of enormous size": (_huge_png, "images/02/000003.png: declares 7000 x 7000 px"),
+    "image of a gigabyte": (
+        lambda f: os.truncate(f / "images/02/000003.png", 10**9),
+        "images/02/000003.png: 1000000000 bytes are too many",
+    ),
     "image of another size": (
         lambda f: write_image(f / "images/01/000002.png", np.zeros((8, 8, 3), np.uint8)),
         "images/01/000002.png: is 8 x 8 px",
