@@ -277,11 +277,19 @@ def _subject_point(
     manifest: CaptureManifest, normalisers: dict[str, Normaliser], frames: tuple[int, ...]
 ) -> SubjectPoint | None:
     """Return the point that names the subject, in pixels of the normalised image of the chosen frame nearest to its own
-    (the first one if it names none). Raises InputError if the point is outside the lens's valid image area."""
+    (the first one if it names none). Raises InputError if the point is outside the image, or the lens's valid area of
+    it."""
     point = manifest.subject_point
     if point is None or not point.camera:
         return point
-    x, y, pictured = normalisers[point.camera].keypoints(np.array([*point.at, 1.0]))
+    normaliser = normalisers[point.camera]
+    width_px, height_px = normaliser.recorded_size_px
+    if not (0 <= point.at[0] <= width_px and 0 <= point.at[1] <= height_px):
+        raise InputError(
+            f"capture.toml: subject: {point.at} is outside the pictures of camera {point.camera}, {width_px} x "
+            f"{height_px} px; correct it"
+        )
+    x, y, pictured = normaliser.keypoints(np.array([*point.at, 1.0]))
     if not pictured:
         raise InputError(f"capture.toml: subject: {point.at} is beyond the lens of camera {point.camera}; correct it")
     frame = min(frames, key=lambda chosen: abs(chosen - point.frame))

@@ -231,8 +231,12 @@ EASYMOCAP = {
         "capture.toml: subject: frame 999 is none of the recording's frames 0 to 4; correct it",
     ),
     "toml with a subject beyond what the lens can image": (
-        lambda f: [rec.write_calibration(f, (-0.3, 0, 0, 0)), _toml('subject = "nearest to (31, 7) in 01"\n')(f)],
-        "capture.toml: subject: (31.0, 7.0) is beyond the lens of camera 01; correct it",
+        lambda f: [rec.write_calibration(f, (-0.5, 0, 0, 0)), _toml('subject = "nearest to (0, 0) in 01"\n')(f)],
+        "capture.toml: subject: (0.0, 0.0) is beyond the lens of camera 01; correct it",
+    ),
+    "toml with a subject outside the pictures": (
+        _toml('subject = "nearest to (31, 7) in 01"\n'),
+        "capture.toml: subject: (31.0, 7.0) is outside the pictures of camera 01, 24 x 16 px; correct it",
     ),
     "toml with a subject in an unknown camera": (
         _toml('subject = "nearest to (1, 2) in 07"\n'),
