@@ -363,7 +363,10 @@ def preset_tree(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
     base = tree.pop("based_on", None)
     if base is None:
         return tree
-    below = named_file(str(base), CONFIGS, "preset", path.parent)
+    try:
+        below = named_file(str(base), CONFIGS, "preset", path.parent)
+    except InputError as error:
+        raise InputError(f"{path}: based_on: {error}") from None
     return _merged(preset_tree(below, (*derived, path.resolve())), tree)
 
 

@@ -161,7 +161,7 @@ def test_a_preset_builds_on_another(tmp_path: Path) -> None:
     (tmp_path / "child.yaml").write_text("based_on: mine.yaml\ntraining: {steps: 7}")
     assert load_settings(str(tmp_path / "child.yaml")).training == mine.model_copy(update={"steps": 7})
     path.write_text("based_on: absent")
-    with pytest.raises(InputError, match=r"^absent: no such preset or file"):
+    with pytest.raises(InputError, match=rf"^{path}: based_on: absent: no such preset or file"):
         load_settings(str(path))
 
 
