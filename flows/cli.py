@@ -172,8 +172,9 @@ def _require_outside_artifacts(out: Path) -> None:
 
 def _recording(options: argparse.Namespace) -> Path | None:
     """Return the recording that a command reads or whose results it reads; None if it is not known."""
-    if options.command is commands.export_cameras:
-        return options.folder.resolve()
+    for command, recording in ((commands.export_cameras, "folder"), (commands.fit, "capture")):
+        if options.command is command:
+            return Path(getattr(options, recording)).resolve()
     if "name" in options:
         subject = options.store / "subjects" / options.name
     elif "subject" in options:
@@ -210,6 +211,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("capture", type=path_or_bucket_url, help="capture folder, its URL in a bucket, or one video")
     _add_overrides(run, "override a setting; `hnerf settings` lists all")
     add(commands.check_cameras, capture, preset)
+    fit = add(commands.fit, capture, preset)
+    _add_out(fit, "motion")
+    _add_overrides(fit, "override a setting; `hnerf settings` lists all")
     add(commands.settings, preset)
 
     caged = argparse.ArgumentParser(add_help=False)

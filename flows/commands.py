@@ -97,6 +97,28 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
     yield f"verdict: {report['verdict']}"
 
 
+def fit(options: argparse.Namespace) -> None:
+    """Fit the body alone, and write its motion as BVH and TRC files; `run` goes on from there."""
+    with atomic_folder(options.out) as partial:
+        from flows.preparation import ingest_recording, prepare_training, with_detections
+        from hnerf.asset.bvh_file import write_body_motion
+        from hnerf.body.fit_result import BodyFit
+        from tasks.calibration import calibrated_capture
+        from tasks.source import read_capture
+        from tasks.store import Store
+
+        settings, store = load_settings(options.preset, options.overrides), Store(options.store.resolve())
+        source, _ = read_capture(options.capture, options.store)
+        recording = with_detections(store, ingest_recording(store, source, settings), settings)
+        prepared = prepare_training(store, recording, settings)
+        capture, body = calibrated_capture(recording, prepared.calibration), BodyFit.load(prepared.body.root)
+        write_body_motion(partial, capture, body, settings.asset.joint_names)
+    report = json.loads((prepared.body.root / "report.json").read_text())
+    print("\n".join([*report.get("doubts", ()), f"stature: {report['stature_m']:.2f} m"]))
+    print(f"frames: {len(body.frames)}, fitted poorly: {report['poor_frames'] or 'none'}")
+    print(f"motion: {options.out / 'motion.bvh'}, {options.out / 'motion.trc'}")
+
+
 def calibrate(options: argparse.Namespace) -> None:
     """Calibrate cameras from footage of a board, or from the person."""
     for name, source in {"ground_frame": "boards", "height": "person", "lens": "person", "fov": "person"}.items():

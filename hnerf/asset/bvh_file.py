@@ -6,29 +6,42 @@ from pathlib import Path
 import numpy as np
 
 from hnerf.asset.motions import Motion, resampled
-from hnerf.asset.rigs import GAME
+from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import FRONT
 from hnerf.asset.skinning import Skin
-from hnerf.asset.staging import CAPTURED, StagedAvatar
+from hnerf.asset.staging import CAPTURED, stage_body
 from hnerf.body.bvh import Bvh, write_bvh
-from hnerf.body.skeletons import OWN, name_in
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.skeletons import OWN, JointNames, name_in
+from hnerf.capture.capture import Capture
+from hnerf.errors import InputError
 
 CENTIMETRES = 100  # per metre; MotionBuilder and Maya read BVH files in centimetres
 SURROUNDED = 0.2  # points whose mean is nearer to their joint than this share of the farthest one's distance
 
 
-def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
-    """Write the captured motion."""
-    rig = avatar.rigs[GAME]
-    ends = CENTIMETRES * tips_m(rig.skeleton.positions_m, rig.skin, avatar.rest_points_m)[1:]
-    write_bvh(path, captured_bvh(avatar), ends)
+def write_body_motion(out: Path, capture: Capture, body: BodyFit, joint_names: JointNames) -> None:
+    """Write the motion of a fitted body into the folder `out`: `motion.bvh` and `motion.trc`. Raises InputError if its
+    poses are too far apart to be interpolated."""
+    try:
+        rig, rest_points_m = stage_body(body, capture.up, capture.fps)
+    except ValueError as error:
+        raise InputError(f"{capture.name}: {error}; list more frames in capture.toml") from None
+    write_captured_bvh(out / "motion.bvh", rig, rest_points_m, joint_names)
+    write_captured_trc(out / "motion.trc", rig, joint_names)
 
 
-def write_avatar_trc(path: Path, avatar: StagedAvatar) -> None:
+def write_captured_bvh(path: Path, rig: StagedRig, rest_points_m: np.ndarray, joint_names: JointNames) -> None:
+    """Write the captured motion of a rig. rest_points_m (V, 3): the surface that follows it, at rest."""
+    ends = CENTIMETRES * tips_m(rig.skeleton.positions_m, rig.skin, rest_points_m)[1:]
+    write_bvh(path, captured_bvh(rig, joint_names), ends)
+
+
+def write_captured_trc(path: Path, rig: StagedRig, joint_names: JointNames) -> None:
     """Write the paths of the joints of the BVH file, in metres, with the frame numbers and times of the capture."""
-    motion = captured_bvh(avatar)
+    motion = captured_bvh(rig, joint_names)
     at_m, fps = motion.world()[1] / CENTIMETRES, 1 / motion.frame_s
-    count, joints, first = len(at_m), len(motion.names), avatar.frames[0]
+    count, joints, first = len(at_m), len(motion.names), int(rig.motions[CAPTURED].codes[0])
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
         "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
@@ -42,10 +55,9 @@ def write_avatar_trc(path: Path, avatar: StagedAvatar) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def captured_bvh(avatar: StagedAvatar) -> Bvh:
-    """Return the captured motion of the game skeleton, from the pelvis down, in every frame of the capture from the
+def captured_bvh(rig: StagedRig, joint_names: JointNames) -> Bvh:
+    """Return the captured motion of a rig's skeleton, from the pelvis down, in every frame of the capture from the
     first pose to the last, in centimetres, Y up."""
-    rig = avatar.rigs[GAME]
     skeleton, poses, stage = rig.skeleton, rig.motions[CAPTURED], rig.stage(CAPTURED)[:, 1:]
     # Relative to rest, where BVH's joints have no rotation.
     turned = stage[..., :3, :3] @ skeleton.rotations[1:].swapaxes(1, 2)
@@ -58,8 +70,8 @@ def captured_bvh(avatar: StagedAvatar) -> Bvh:
     motion = resampled(captured, poses.fps)
     positions = np.tile(offsets, (len(motion.codes), 1, 1))
     positions[:, 0] = CENTIMETRES * motion.origins_m
-    own = avatar.joint_names == OWN
-    named_as = "mixamo" if own else avatar.joint_names
+    own = joint_names == OWN
+    named_as = "mixamo" if own else joint_names
     names = tuple(name_in(named_as, name, prefixed=not own) for name in skeleton.names[1:])
     return Bvh(names, parents, offsets, 1 / motion.fps, positions, motion.turns)
 

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from hnerf.asset.baking import Filled, baked_textures
 from hnerf.asset.blender import write_with_blender
-from hnerf.asset.bvh_file import write_avatar_bvh, write_avatar_trc
+from hnerf.asset.bvh_file import write_captured_bvh, write_captured_trc
 from hnerf.asset.comparison import Compared, compare_with_field, comparison_figures, require_close
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.extreme_poses import extreme_poses
@@ -294,8 +294,8 @@ def write_files(out: Path, avatars: Avatars, capture: Capture, info: AssetInfo, 
     write_glb(out / "avatar.glb", staged, staged.rigs[FULL], info)
     write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME], info)
     if staged.rates:
-        write_avatar_bvh(out / "avatar.bvh", staged)
-        write_avatar_trc(out / "avatar.trc", staged)
+        write_captured_bvh(out / "avatar.bvh", staged.rigs[GAME], staged.rest_points_m, staged.joint_names)
+        write_captured_trc(out / "avatar.trc", staged.rigs[GAME], staged.joint_names)
     else:
         log.warning(
             "%s: no avatar_24.usda, avatar_30.usda, avatar.bvh and avatar.trc: the captured poses are too far apart to "

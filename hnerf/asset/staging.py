@@ -5,16 +5,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 
 from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import Correctives
 from hnerf.asset.levels import Level, levels_of
 from hnerf.asset.motions import LONGEST_S, Motion, motion_of, resampled
-from hnerf.asset.rigs import FULL, RestSurface, StagedRig, stage_rigs
+from hnerf.asset.rigs import FULL, GAME, RestSurface, StagedRig, stage_rigs
 from hnerf.asset.skeleton import Bones
 from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import Rig
 from hnerf.body.skeletons import OWN, JointNames
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP, y_up_from
 from hnerf.geometry.camera import Camera
@@ -151,13 +153,12 @@ def stage_avatar(
     counts of the lower levels of detail; expressions_m, physiques_m (V, 3): of the face and of other bodies, in the
     body's axes."""
     world, rig, body = y_up_from(up), clothed.rig, Y_UP_FROM_Z_UP
-    rest_m, joints_m = rig.vertices_m.double().numpy() @ body.T, rig.joints_m.double().numpy() @ body.T
-    stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
-    rest = RestSurface(rest_m - stands_m, correctives.offsets_m @ body.T.astype(np.float32))
+    rest_m, joints_m = _at_rest(rig)
+    rest = RestSurface(rest_m, correctives.offsets_m @ body.T.astype(np.float32))
     points_m = surfaces_m @ world.T.astype(np.float32)
     motions = _motions(clothed, fps, correctives.weights, further, world)
     floor_m = float(np.median(points_m[..., 1].min(1)))  # the median, since some frames have a foot centimetres lower
-    rigs = stage_rigs(rig, joints_m - stands_m, rest, motions, floor_m, bones)
+    rigs = stage_rigs(rig, joints_m, rest, motions, floor_m, bones)
     return StagedAvatar(
         rest_points_m=rest.points_m,
         levels=levels_of(rest.points_m, rig.faces.numpy(), layout, level_faces, expressions_m),
@@ -174,6 +175,30 @@ def stage_avatar(
         normal_map=normal_map,
         joint_names=joint_names,
     )
+
+
+def stage_body(body: BodyFit, up: str, fps: float) -> tuple[StagedRig, np.ndarray]:
+    """Return the game rig of a fitted body, with its captured motion alone, and the surface (V, 3) at rest that follows
+    it; `up` and fps as for `stage_avatar`. Raises ValueError if the poses are too far apart to be interpolated."""
+    rest_m, joints_m = _at_rest(body.rig)
+    captured = motion_of(body, fps, np.zeros((len(body.frames), 0)), y_up_from(up))
+    if not _is_dense(captured):
+        raise ValueError(f"poses are more than {LONGEST_S} s apart on average")
+    floor_m = float((body.vertices_m() @ torch.from_numpy(y_up_from(up)[1]).float()).amin(1).median())
+    rest = RestSurface(rest_m, np.zeros((0, *rest_m.shape)))
+    return stage_rigs(body.rig, joints_m, rest, {CAPTURED: captured}, floor_m, "along")[GAME], rest_m
+
+
+def _at_rest(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices (V, 3) and the joints (S, 3) of a body at rest, Y up, standing at the origin."""
+    rest_m, joints_m = (m.double().numpy() @ Y_UP_FROM_Z_UP.T for m in (rig.vertices_m, rig.joints_m))
+    stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
+    return rest_m - stands_m, joints_m - stands_m
+
+
+def _is_dense(captured: Motion) -> bool:
+    """Return whether poses are near enough in time to be interpolated, on average."""
+    return bool(np.ptp(captured.seconds) <= LONGEST_S * (len(captured.codes) - 1) + 1e-6)
 
 
 def shape_names(avatar: StagedAvatar) -> list[str]:
@@ -215,7 +240,7 @@ def _motions(
     instant."""
     captured = motion_of(clothed, fps, weights, world)
     motions = {CAPTURED: captured}
-    if np.ptp(captured.seconds) <= LONGEST_S * (len(captured.codes) - 1) + 1e-6:
+    if _is_dense(captured):
         motions |= {f"{CAPTURED}_{rate}": resampled(captured, rate) for rate in RATES}
     for name, (body, rate) in further.items():
         motion = motion_of(body, rate, np.zeros((len(body.frames), weights.shape[1]), np.float32), world)

@@ -6,16 +6,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hnerf.asset.bvh_file import tips_m, write_avatar_bvh, write_avatar_trc
+from hnerf.asset.bvh_file import tips_m, write_body_motion, write_captured_bvh, write_captured_trc
+from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.bvh import read_bvh
 from hnerf.body.skeletons import JointNames
+from hnerf.capture.capture import Capture
+from hnerf.errors import InputError
+from tests.asset.figure import FRAMES, bending_body
 
 
-def with_axes(staged: StagedAvatar, axes: np.ndarray) -> StagedAvatar:
-    """Return the avatar with the axes of all joints of its game rig rotated."""
-    game, turn = staged.rigs["game"], np.eye(4)
+def with_axes(game: StagedRig, axes: np.ndarray) -> StagedRig:
+    """Return the rig with the axes of all joints rotated."""
+    turn = np.eye(4)
     turn[:3, :3] = axes
     skeleton = dataclasses.replace(game.skeleton, rotations=game.skeleton.rotations @ axes)
     motions = {}
@@ -24,16 +28,25 @@ def with_axes(staged: StagedAvatar, axes: np.ndarray) -> StagedAvatar:
         quaternions = Rotation.from_matrix(local[..., :3, :3].reshape(-1, 3, 3)).as_quat()
         quaternions = quaternions.reshape(motion.quaternions.shape)
         motions[name] = dataclasses.replace(motion, translations_m=local[..., :3, 3], quaternions=quaternions)
-    return dataclasses.replace(
-        staged, rigs=staged.rigs | {"game": dataclasses.replace(game, skeleton=skeleton, motions=motions)}
-    )
+    return dataclasses.replace(game, skeleton=skeleton, motions=motions)
+
+
+def recorded(fps: float) -> Capture:
+    """Return a capture without cameras, whose world has Z up."""
+    return Capture("ada", Path(), {}, (), (), FRAMES, (), fps, "z", {}, {})
+
+
+def end_site(path: Path) -> list[float]:
+    """Return the offset of the only end site."""
+    (end,) = re.findall(r"End Site\n\s*{\n\s*OFFSET (.*)", path.read_text())
+    return [float(x) for x in end.split()]
 
 
 @pytest.mark.parametrize(("joint_names", "pelvis"), [("mixamo", "mixamorig:Hips"), ("ue5", "pelvis"), ("vrm", "hips")])
 def test_bvh_has_the_joint_names_of_the_asset(
     joint_names: JointNames, pelvis: str, staged: StagedAvatar, tmp_path: Path
 ) -> None:
-    write_avatar_bvh(tmp_path / "avatar.bvh", dataclasses.replace(staged, joint_names=joint_names))
+    write_captured_bvh(tmp_path / "avatar.bvh", staged.rigs["game"], staged.rest_points_m, joint_names)
     assert read_bvh(tmp_path / "avatar.bvh").names == (pelvis, "upper_L")
 
 
@@ -41,7 +54,7 @@ def test_bvh_has_the_joint_names_of_the_asset(
 def test_bvh_holds_the_captured_motion_in_centimetres(axes: np.ndarray, staged: StagedAvatar, tmp_path: Path) -> None:
     """The frames 3 to 8, at 10 a second, are rows 0 to 5; the poses of 6 and 7 are interpolated. In frame f the pelvis
     is at (0.1 f, 2, 0.5) of a world with Z up, and the upper joint, 80 cm above it, has turned by 0.1 f about x."""
-    write_avatar_bvh(tmp_path / "avatar.bvh", with_axes(staged, axes))
+    write_captured_bvh(tmp_path / "avatar.bvh", with_axes(staged.rigs["game"], axes), staged.rest_points_m, "own")
     file = read_bvh(tmp_path / "avatar.bvh")
     assert (file.names, file.parents.tolist(), len(file.positions)) == (("Hips", "upper_L"), [-1, 0], 6)
     assert file.frame_s == 0.1
@@ -57,13 +70,32 @@ def test_bvh_holds_the_captured_motion_in_centimetres(axes: np.ndarray, staged: 
 
 def test_trc_holds_the_joints_paths_in_metres(staged: StagedAvatar, tmp_path: Path) -> None:
     """Frame 6, the fourth from frame 3 on, is 0.6 s after frame 0 at 10 a second; its pose is interpolated."""
-    write_avatar_trc(tmp_path / "avatar.trc", staged)
+    write_captured_trc(tmp_path / "avatar.trc", staged.rigs["game"], "own")
     lines = (tmp_path / "avatar.trc").read_text().split("\n")
     assert lines[2:6] == ["10\t10\t6\t2\tm\t10\t3\t6", "Frame#\tTime\tHips\t\t\tupper_L\t\t",
                           "\t\tX1\tY1\tZ1\tX2\tY2\tZ2", ""]  # fmt: skip
     assert len(lines[6:]) == 7 and lines[9].split("\t")[0] == "6"
     found = [float(value) for value in lines[9].split("\t")[1:]]
     np.testing.assert_allclose(found, [0.6, 0.6, 0.5, -2.0, 0.6, 1.3, -2.0], atol=1e-5)
+
+
+def test_a_fitted_body_moves_as_its_avatar_does(staged: StagedAvatar, tmp_path: Path) -> None:
+    """Only the name of the file and the end of the last bone, which the clothes make longer, differ."""
+    write_body_motion(tmp_path, recorded(fps=10.0), bending_body(), "own")
+    write_captured_bvh(tmp_path / "avatar.bvh", staged.rigs["game"], staged.rest_points_m, "own")
+    write_captured_trc(tmp_path / "avatar.trc", staged.rigs["game"], "own")
+    for name, differ in (("bvh", ["OFFSET"]), ("trc", ["PathFileType"])):
+        found, expected = ((tmp_path / f"{stem}.{name}").read_text().split("\n") for stem in ("motion", "avatar"))
+        pairs = zip(found, expected, strict=True)
+        assert [a.split()[0] for a, b in pairs if a != b] == differ
+    np.testing.assert_allclose(end_site(tmp_path / "motion.bvh"), [0, 80, 0], atol=1e-4)
+
+
+def test_the_motion_of_a_body_with_gaps_is_refused(tmp_path: Path) -> None:
+    """Four frames, 3 to 8, at 1 a second lie 5 / 3 s apart on average."""
+    with pytest.raises(InputError, match=r"ada: poses are more than 0\.7 s apart on average; list more frames"):
+        write_body_motion(tmp_path, recorded(fps=1.0), bending_body(), "own")
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_tip_of_a_joint_is_the_end_of_its_points() -> None:
@@ -82,6 +114,5 @@ def test_the_tip_of_a_joint_is_the_end_of_its_points() -> None:
 
 def test_end_sites_are_the_tips_of_the_end_joints(staged: StagedAvatar, tmp_path: Path) -> None:
     """The column's upper joint, at a height of 0.8 m, ends in the middle of its top, with clothes 1.65 m high."""
-    write_avatar_bvh(tmp_path / "avatar.bvh", staged)
-    (end,) = re.findall(r"End Site\n\s*{\n\s*OFFSET (.*)", (tmp_path / "avatar.bvh").read_text())
-    np.testing.assert_allclose([float(x) for x in end.split()], [0, 85, 0], atol=0.5)
+    write_captured_bvh(tmp_path / "avatar.bvh", staged.rigs["game"], staged.rest_points_m, "own")
+    np.testing.assert_allclose(end_site(tmp_path / "avatar.bvh"), [0, 85, 0], atol=0.5)

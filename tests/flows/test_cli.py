@@ -12,6 +12,7 @@ import pytest
 from flows.cli import CACHES, CAMERA_FORMATS, ORBIT_PICTURES, PICTURES, SIZES_PX, STATURE_M, main
 from flows.train_subject import Trained, train_subject
 from hnerf import synthetic
+from hnerf.body.bvh import read_bvh
 from hnerf.calibration.diagnosis import BODY_HEIGHT_M
 from hnerf.capture.formats.export import WRITERS
 from hnerf.config import AssetSettings, SyntheticSettings
@@ -22,6 +23,7 @@ from tasks.bucket import BucketError
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError, current_limits
 from tasks.store import Store
+from tests.asset.figure import bending_body
 from tests.capture.recordings import write_easymocap
 from tests.shared_data import shared_capture
 
@@ -227,6 +229,9 @@ def test_cameras_are_not_exported_into_the_recording(
     assert main(["export-cameras", str(folder), "--format", "colmap", "--out", "cameras"]) == 2
     assert "cameras: lies in the recording" in capsys.readouterr().err
     assert sorted(folder.iterdir()) == before
+    assert main(["fit", str(folder)]) == 2
+    assert "motion: lies in the recording" in capsys.readouterr().err
+    assert sorted(folder.iterdir()) == before
     assert main(["export-cameras", str(folder), "--format", "colmap", "--out", "../ada-cameras"]) == 0
 
 
@@ -297,6 +302,28 @@ def test_check_cameras_prints_every_camera_and_the_verdict(
     assert f"verdict: {report['verdict']}" in table
     for name in ("05", "06"):
         assert f"{name:<12} not judged: a camera for testing" in table
+
+
+def test_fit_writes_the_motion_and_says_how_good_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    prepared, capture = Mock(), Mock(up="z", fps=10.0)
+    prepared.body.root = tmp_path / "fit"
+    prepared.body.root.mkdir()
+    bending_body().save(prepared.body.root)
+    report = {"stature_m": 1.7, "poor_frames": [5], "doubts": ["one camera does not determine depth"]}
+    (prepared.body.root / "report.json").write_text(json.dumps(report))
+    for name in ("ingest_recording", "with_detections"):
+        monkeypatch.setattr(f"flows.preparation.{name}", Mock())
+    monkeypatch.setattr("flows.preparation.prepare_training", lambda *_: prepared)
+    monkeypatch.setattr("tasks.calibration.calibrated_capture", lambda *_: capture)
+    assert main(["fit", str(write_easymocap(tmp_path / "ada")), "--set", "asset.joint_names=ue5"]) == 0
+    doubt, stature, frames, motion = capsys.readouterr().out.splitlines()[-4:]
+    assert (doubt, stature) == (report["doubts"][0], "stature: 1.70 m")
+    assert (frames, motion) == ("frames: 4, fitted poorly: [5]", "motion: motion/motion.bvh, motion/motion.trc")
+    assert read_bvh(Path("motion/motion.bvh")).names[0] == "pelvis"
+    assert sorted(path.name for path in Path("motion").iterdir()) == ["motion.bvh", "motion.trc"]
 
 
 def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
