@@ -158,6 +158,25 @@ def test_empty_space_has_no_elastic_loss(field: NerfiesField, monkeypatch: pytes
     assert found is not None and found.item() == 0
 
 
+def test_samples_are_moved_into_the_template(field: NerfiesField, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A constant screw without rotation moves all of them alike."""
+    seen: list[torch.Tensor] = []
+
+    def template(point: torch.Tensor, view: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append(point)
+        return 0 * point[..., 0], 0 * point
+
+    monkeypatch.setattr(field.template, "forward", template)
+    move = torch.tensor([0.1, -0.2, 0.3])
+    with torch.no_grad():
+        field.deformation.screw.weight.zero_()
+        for turn_and_move in (torch.zeros(6), torch.cat([torch.zeros(3), move])):
+            field.deformation.screw.bias.copy_(turn_and_move)
+            evaluate(field, training=False)
+    still, _, moved, _ = seen  # the fine samples follow the coarse ones
+    torch.testing.assert_close(moved - still, move.expand_as(still), atol=1e-6, rtol=0)
+
+
 def test_the_deformation_uses_all_octaves_only_after_annealing(field: NerfiesField) -> None:
     """After the annealing share of training, a random screw sees the complete encoding; before that, it does not."""
     assert field.settings.anneal_share == 0.3333
