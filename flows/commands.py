@@ -101,17 +101,20 @@ def fit(options: argparse.Namespace) -> None:
     """Fit the body alone, and write its motion as BVH and TRC files; `run` goes on from there."""
     with atomic_folder(options.out) as partial:
         from flows.preparation import ingest_recording, prepare_training, with_detections
-        from hnerf.asset.bvh_file import write_body_motion
+        from hnerf.asset.bvh_file import require_dense, write_body_motion
         from hnerf.body.fit_result import BodyFit
+        from hnerf.capture.capture import Capture
         from tasks.calibration import calibrated_capture
         from tasks.source import read_capture
         from tasks.store import Store
 
         settings, store = load_settings(options.preset, options.overrides), Store(options.store.resolve())
         source, _ = read_capture(options.capture, options.store)
-        recording = with_detections(store, ingest_recording(store, source, settings), settings)
-        prepared = prepare_training(store, recording, settings)
-        capture, body = calibrated_capture(recording, prepared.calibration), BodyFit.load(prepared.body.root)
+        recorded = ingest_recording(store, source, settings)
+        require_dense(Capture.load(recorded.root))  # the stages after this one take minutes
+        prepared = prepare_training(store, with_detections(store, recorded, settings), settings)
+        capture = calibrated_capture(prepared.recording, prepared.calibration)
+        body = BodyFit.load(prepared.body.root)
         write_body_motion(partial, capture, body, settings.asset.joint_names)
     report = json.loads((prepared.body.root / "report.json").read_text())
     print("\n".join([*report.get("doubts", ()), f"stature: {report['stature_m']:.2f} m"]))

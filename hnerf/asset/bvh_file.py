@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hnerf.asset.motions import Motion, resampled
+from hnerf.asset.motions import LONGEST_S, Motion, is_dense, resampled
 from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import FRONT
 from hnerf.asset.skinning import Skin
@@ -20,13 +20,18 @@ CENTIMETRES = 100  # per metre; MotionBuilder and Maya read BVH files in centime
 SURROUNDED = 0.2  # points whose mean is nearer to their joint than this share of the farthest one's distance
 
 
+def require_dense(capture: Capture) -> None:
+    """Raise InputError if the poses of a capture's frames will be too far apart to be interpolated."""
+    if not is_dense(np.array(capture.frames) / capture.fps):
+        raise InputError(
+            f"{capture.name}: frames are more than {LONGEST_S} s apart on average; "
+            "give --set capture.max_frames=100000, or list more frames if capture.toml lists any"
+        )
+
+
 def write_body_motion(out: Path, capture: Capture, body: BodyFit, joint_names: JointNames) -> None:
-    """Write the motion of a fitted body into the folder `out`: `motion.bvh` and `motion.trc`. Raises InputError if its
-    poses are too far apart to be interpolated."""
-    try:
-        rig, rest_points_m = stage_body(body, capture.up, capture.fps)
-    except ValueError as error:
-        raise InputError(f"{capture.name}: {error}; list more frames in capture.toml") from None
+    """Write the motion of a fitted body into the folder `out`: `motion.bvh` and `motion.trc`."""
+    rig, rest_points_m = stage_body(body, capture.up, capture.fps)
     write_captured_bvh(out / "motion.bvh", rig, rest_points_m, joint_names)
     write_captured_trc(out / "motion.trc", rig, joint_names)
 

@@ -59,6 +59,11 @@ def motion_of(body: BodyFit, fps: float, shape_weights: np.ndarray, stage_from_w
     return Motion(fps, np.array(body.frames, float), turns, origins_m, shape_weights)
 
 
+def is_dense(seconds: np.ndarray) -> bool:
+    """Return whether poses at instants (n,), in order, are near enough to be interpolated, on average."""
+    return bool(np.ptp(seconds) <= LONGEST_S * (len(seconds) - 1) + 1e-6)
+
+
 def resampled(motion: Motion, fps: float) -> Motion:
     """Return the motion at all whole time codes of another rate within its range; if there is none, at the nearest.
 

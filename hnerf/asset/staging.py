@@ -10,7 +10,7 @@ import torch
 from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import Correctives
 from hnerf.asset.levels import Level, levels_of
-from hnerf.asset.motions import LONGEST_S, Motion, motion_of, resampled
+from hnerf.asset.motions import Motion, is_dense, motion_of, resampled
 from hnerf.asset.rigs import FULL, GAME, RestSurface, StagedRig, stage_rigs
 from hnerf.asset.skeleton import Bones
 from hnerf.asset.texture import UvLayout
@@ -179,11 +179,9 @@ def stage_avatar(
 
 def stage_body(body: BodyFit, up: str, fps: float) -> tuple[StagedRig, np.ndarray]:
     """Return the game rig of a fitted body, with its captured motion alone, and the surface (V, 3) at rest that follows
-    it; `up` and fps as for `stage_avatar`. Raises ValueError if the poses are too far apart to be interpolated."""
+    it; `up` and fps as for `stage_avatar`."""
     rest_m, joints_m = _at_rest(body.rig)
     captured = motion_of(body, fps, np.zeros((len(body.frames), 0)), y_up_from(up))
-    if not _is_dense(captured):
-        raise ValueError(f"poses are more than {LONGEST_S} s apart on average")
     floor_m = float((body.vertices_m() @ torch.from_numpy(y_up_from(up)[1]).float()).amin(1).median())
     rest = RestSurface(rest_m, np.zeros((0, *rest_m.shape)))
     return stage_rigs(body.rig, joints_m, rest, {CAPTURED: captured}, floor_m, "along")[GAME], rest_m
@@ -194,11 +192,6 @@ def _at_rest(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     rest_m, joints_m = (m.double().numpy() @ Y_UP_FROM_Z_UP.T for m in (rig.vertices_m, rig.joints_m))
     stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
     return rest_m - stands_m, joints_m - stands_m
-
-
-def _is_dense(captured: Motion) -> bool:
-    """Return whether poses are near enough in time to be interpolated, on average."""
-    return bool(np.ptp(captured.seconds) <= LONGEST_S * (len(captured.codes) - 1) + 1e-6)
 
 
 def shape_names(avatar: StagedAvatar) -> list[str]:
@@ -240,7 +233,7 @@ def _motions(
     instant."""
     captured = motion_of(clothed, fps, weights, world)
     motions = {CAPTURED: captured}
-    if _is_dense(captured):
+    if is_dense(captured.seconds):
         motions |= {f"{CAPTURED}_{rate}": resampled(captured, rate) for rate in RATES}
     for name, (body, rate) in further.items():
         motion = motion_of(body, rate, np.zeros((len(body.frames), weights.shape[1]), np.float32), world)

@@ -23,7 +23,7 @@ from tasks.bucket import BucketError
 from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError, current_limits
 from tasks.store import Store
-from tests.asset.figure import bending_body
+from tests.asset.figure import FRAMES, bending_body
 from tests.capture.recordings import write_easymocap
 from tests.shared_data import shared_capture
 
@@ -308,22 +308,43 @@ def test_fit_writes_the_motion_and_says_how_good_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    prepared, capture = Mock(), Mock(up="z", fps=10.0)
-    prepared.body.root = tmp_path / "fit"
-    prepared.body.root.mkdir()
-    bending_body().save(prepared.body.root)
     report = {"stature_m": 1.7, "poor_frames": [5], "doubts": ["one camera does not determine depth"]}
-    (prepared.body.root / "report.json").write_text(json.dumps(report))
-    for name in ("ingest_recording", "with_detections"):
-        monkeypatch.setattr(f"flows.preparation.{name}", Mock())
-    monkeypatch.setattr("flows.preparation.prepare_training", lambda *_: prepared)
-    monkeypatch.setattr("tasks.calibration.calibrated_capture", lambda *_: capture)
+    prepared = fitted(monkeypatch, tmp_path, Mock(up="z", fps=10.0, frames=FRAMES), body=report)
+    bending_body().save(prepared.body.root)
     assert main(["fit", str(write_easymocap(tmp_path / "ada")), "--set", "asset.joint_names=ue5"]) == 0
     doubt, stature, frames, motion = capsys.readouterr().out.splitlines()[-4:]
     assert (doubt, stature) == (report["doubts"][0], "stature: 1.70 m")
     assert (frames, motion) == ("frames: 4, fitted poorly: [5]", "motion: motion/motion.bvh, motion/motion.trc")
     assert read_bvh(Path("motion/motion.bvh")).names[0] == "pelvis"
     assert sorted(path.name for path in Path("motion").iterdir()) == ["motion.bvh", "motion.trc"]
+
+
+def test_fit_refuses_frames_far_apart_before_it_looks_at_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Four frames, 3 to 8, at 1 a second lie 5 / 3 s apart on average."""
+    monkeypatch.chdir(tmp_path)
+    fitted(monkeypatch, tmp_path, Mock(fps=1.0, frames=FRAMES))
+    monkeypatch.setattr("flows.preparation.with_detections", Mock(side_effect=AssertionError))
+    assert main(["fit", str(write_easymocap(tmp_path / "ada"))]) == 2
+    why = "frames are more than 0.7 s apart on average; give --set capture.max_frames=100000, or list more frames"
+    assert why in capsys.readouterr().err
+    assert not Path("motion").exists()
+
+
+def fitted(monkeypatch: pytest.MonkeyPatch, folder: Path, capture: Mock, **reports: dict[str, Any]) -> Mock:
+    """Let all stages of `hnerf fit` find a capture and these reports in a folder; return the results."""
+    prepared = Mock()
+    for stage, report in reports.items():
+        getattr(prepared, stage).root = folder / stage
+        (folder / stage).mkdir()
+        (folder / stage / "report.json").write_text(json.dumps(report))
+    for name in ("ingest_recording", "with_detections"):
+        monkeypatch.setattr(f"flows.preparation.{name}", Mock())
+    monkeypatch.setattr("flows.preparation.prepare_training", lambda *_: prepared)
+    monkeypatch.setattr("hnerf.capture.capture.Capture.load", lambda _: capture)
+    monkeypatch.setattr("tasks.calibration.calibrated_capture", lambda *_: capture)
+    return prepared
 
 
 def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
