@@ -6,9 +6,11 @@ Each function imports what it needs, so that the others, and help, need not wait
 import argparse
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from flows.settings_list import settings_list
@@ -103,6 +105,7 @@ def fit(options: argparse.Namespace) -> None:
         from flows.preparation import ingest_recording, prepare_training, with_detections
         from hnerf.asset.bvh_file import require_dense, write_body_motion
         from hnerf.body.fit_result import BodyFit
+        from hnerf.body.keypoint_fit import metres_per_pixel
         from hnerf.capture.capture import Capture
         from tasks.calibration import calibrated_capture
         from tasks.source import read_capture
@@ -116,10 +119,42 @@ def fit(options: argparse.Namespace) -> None:
         capture = calibrated_capture(prepared.recording, prepared.calibration)
         body = BodyFit.load(prepared.body.root)
         write_body_motion(partial, capture, body, settings.asset.joint_names)
-    report = json.loads((prepared.body.root / "report.json").read_text())
-    print("\n".join([*report.get("doubts", ()), f"stature: {report['stature_m']:.2f} m"]))
-    print(f"frames: {len(body.frames)}, fitted poorly: {report['poor_frames'] or 'none'}")
+    made = (prepared.calibration, prepared.body)
+    checked, report = (json.loads((artifact.root / "report.json").read_text()) for artifact in made)
+    pixel_m = metres_per_pixel(tuple(capture.cameras[name] for name in capture.train_cameras), body).mean(0).tolist()
+    print("\n".join(_fit_quality(checked, report, pixel_m)))
+    print(_frame_counts(body.frames, capture.fps))
+    print(f"report: {prepared.body.root / 'report.json'}")
     print(f"motion: {options.out / 'motion.bvh'}, {options.out / 'motion.trc'}")
+
+
+def _fit_quality(checked: dict[str, Any], report: dict[str, Any], pixel_m: list[float]) -> Iterator[str]:
+    """Yield the reports of calibration and fit as lines for people. pixel_m: what a pixel spans, by frame."""
+    yield from [*checked["doubts"], *report.get("doubts", ())]
+    cameras = [
+        f"{name} {camera['status']}" + (f" ({camera['median_px']:.1f} px)" if camera["median_px"] is not None else "")
+        for name, camera in checked["cameras"].items()
+    ]
+    yield f"cameras: {', '.join(cameras)}; `hnerf check-cameras` says more"
+    rows = zip(report["keypoint_residual_px"], pixel_m, report["frames"], strict=True)
+    seen = [(px, 1e3 * span_m * px, frame) for px, span_m, frame in rows if px is not None]
+    if seen:
+        px, mm = median(row[0] for row in seen), median(row[1] for row in seen)
+        worst_px, _, frame = max(seen)
+        yield f"keypoints: {px:.1f} px from the body's, about {mm:.0f} mm; most in frame {frame}: {worst_px:.1f} px"
+    yield f"stature: {report['stature_m']:.2f} m"
+    yield f"fitted poorly: {report['poor_frames'] or 'no frame'}"
+
+
+def _frame_counts(frames: Sequence[int], fps: float) -> str:
+    """Return how many frames of a motion were fitted, for people."""
+    from hnerf.asset.motions import LONGEST_S
+
+    between = [b - a - 1 for a, b in pairwise(frames)]
+    held = sum(count for count in between if count + 1 > LONGEST_S * fps + 1e-6)
+    counts = {"fitted": len(frames), "interpolated": sum(between) - held, f"held in gaps over {LONGEST_S} s": held}
+    listed = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+    return f"frames: {frames[0]} to {frames[-1]}, {fps:.4g} a second: {listed}"
 
 
 def calibrate(options: argparse.Namespace) -> None:

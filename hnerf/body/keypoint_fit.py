@@ -9,6 +9,7 @@ from torch import Tensor
 from hnerf.body.articulation import Articulation, Points, Pose, with_offsets
 from hnerf.body.balance import Balance
 from hnerf.body.body_model import BodyModel
+from hnerf.body.fit_result import BodyFit
 from hnerf.body.ground import Ground
 from hnerf.body.hand_points import PalmTerm
 from hnerf.body.limb_depths import LimbDepths
@@ -142,9 +143,9 @@ def levenberg_marquardt(problem: Problem, pose: Pose, steps: int) -> Pose:
     return pose
 
 
-def metres_per_pixel(cameras: tuple[Camera, ...], pose: Pose) -> Tensor:
-    """Return the length that a pixel spans at the body's root, (C, n) metres."""
-    centre = pose.root @ torch.cat([pose.rig.joints_m[0], torch.ones(1, dtype=pose.root.dtype)])
+def metres_per_pixel(cameras: tuple[Camera, ...], body: Pose | BodyFit) -> Tensor:
+    """Return the length that a pixel spans at the body's root, (C, n) metres, float64."""
+    centre = body.root.double() @ torch.cat([body.rig.joints_m[0].double(), torch.ones(1, dtype=torch.float64)])
     depth = [centre[:, :3] @ torch.from_numpy(c.R[2]) + float(c.t_m[2]) for c in cameras]
     return torch.stack(
         [d.clamp(min=NEAR_M) / float(c.K[[0, 1], [0, 1]].mean()) for c, d in zip(cameras, depth, strict=True)]

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from flows.cli import CACHES, CAMERA_FORMATS, ORBIT_PICTURES, PICTURES, SIZES_PX, STATURE_M, main
+from flows.commands import _frame_counts
 from flows.train_subject import Trained, train_subject
 from hnerf import synthetic
 from hnerf.body.bvh import read_bvh
@@ -17,6 +19,7 @@ from hnerf.calibration.diagnosis import BODY_HEIGHT_M
 from hnerf.capture.formats.export import WRITERS
 from hnerf.config import AssetSettings, SyntheticSettings
 from hnerf.errors import InvalidAsset
+from hnerf.geometry.camera import Camera
 from hnerf.render.subject import MAX_SIZE_PX, MIN_SIZE_PX, OUTPUT_KINDS, RenderOptions
 from hnerf.render.subject import ORBIT_PICTURES as PICTURES_OF_AN_ORBIT
 from tasks.bucket import BucketError
@@ -307,14 +310,31 @@ def test_check_cameras_prints_every_camera_and_the_verdict(
 def test_fit_writes_the_motion_and_says_how_good_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """The frames 3, 4, 5 and 8 are fitted. The camera is 4 m in front of the body, so a pixel spans 20 mm."""
     monkeypatch.chdir(tmp_path)
-    report = {"stature_m": 1.7, "poor_frames": [5], "doubts": ["one camera does not determine depth"]}
-    prepared = fitted(monkeypatch, tmp_path, Mock(up="z", fps=10.0, frames=FRAMES), body=report)
+    intrinsics = np.array([[200.0, 0, 32], [0, 200, 32], [0, 0, 1]])
+    camera = Camera("01", intrinsics, np.eye(3), np.array([0, 0, 3.5]), 64, 64)
+    capture = Mock(up="z", fps=10.0, frames=FRAMES, cameras={"01": camera}, train_cameras=("01",))
+    report = {
+        "stature_m": 1.7, "poor_frames": [5], "doubts": ["one camera does not determine depth"],
+        "frames": FRAMES, "keypoint_residual_px": [1.0, 2.0, 6.0, None],
+    }  # fmt: skip
+    cameras = {"01": {"status": "ok", "median_px": 1.25}, "02": {"status": "rejected", "median_px": None}}
+    checked = {"doubts": ["the light changes"], "cameras": cameras}
+    prepared = fitted(monkeypatch, tmp_path, capture, calibration=checked, body=report)
     bending_body().save(prepared.body.root)
     assert main(["fit", str(write_easymocap(tmp_path / "ada")), "--set", "asset.joint_names=ue5"]) == 0
-    doubt, stature, frames, motion = capsys.readouterr().out.splitlines()[-4:]
-    assert (doubt, stature) == (report["doubts"][0], "stature: 1.70 m")
-    assert (frames, motion) == ("frames: 4, fitted poorly: [5]", "motion: motion/motion.bvh, motion/motion.trc")
+    assert capsys.readouterr().out.splitlines()[-9:] == [
+        "the light changes",
+        "one camera does not determine depth",
+        "cameras: 01 ok (1.2 px), 02 rejected; `hnerf check-cameras` says more",
+        "keypoints: 2.0 px from the body's, about 40 mm; most in frame 5: 6.0 px",
+        "stature: 1.70 m",
+        "fitted poorly: [5]",
+        "frames: 3 to 8, 10 a second: 4 fitted, 2 interpolated",
+        f"report: {tmp_path / 'body' / 'report.json'}",
+        "motion: motion/motion.bvh, motion/motion.trc",
+    ]
     assert read_bvh(Path("motion/motion.bvh")).names[0] == "pelvis"
     assert sorted(path.name for path in Path("motion").iterdir()) == ["motion.bvh", "motion.trc"]
 
@@ -345,6 +365,15 @@ def fitted(monkeypatch: pytest.MonkeyPatch, folder: Path, capture: Mock, **repor
     monkeypatch.setattr("hnerf.capture.capture.Capture.load", lambda _: capture)
     monkeypatch.setattr("tasks.calibration.calibrated_capture", lambda *_: capture)
     return prepared
+
+
+@pytest.mark.parametrize(
+    ("fps", "counts"),
+    [(30, "5 fitted, 18 interpolated"), (20, "5 fitted, 3 interpolated, 15 held in gaps over 0.7 s")],
+)
+def test_fit_counts_the_frames_that_it_made_up(fps: float, counts: str) -> None:
+    """Frames 2 to 4 lie between two poses, and 8 to 22 between two that are 16 frames apart: 0.53 or 0.8 s."""
+    assert _frame_counts((1, 5, 6, 7, 23), fps).endswith(f"a second: {counts}")
 
 
 def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
