@@ -238,6 +238,14 @@ EASYMOCAP = {
         _toml('subject = "nearest to (31, 7) in 01"\n'),
         "capture.toml: subject: (31.0, 7.0) is outside the pictures of camera 01, 24 x 16 px; correct it",
     ),
+    "toml with a subject below the pictures": (
+        _toml('subject = "nearest to (20, 17) in 01"\n'),
+        "capture.toml: subject: (20.0, 17.0) is outside the pictures of camera 01, 24 x 16 px; correct it",
+    ),
+    "toml with a subject left of the pictures": (
+        _toml('subject = "nearest to (-1, 7) in 01"\n'),
+        "capture.toml: subject: (-1.0, 7.0) is outside the pictures of camera 01, 24 x 16 px; correct it",
+    ),
     "toml with a subject in an unknown camera": (
         _toml('subject = "nearest to (1, 2) in 07"\n'),
         "no training camera 07",
