@@ -154,6 +154,8 @@ def _existing(options: argparse.Namespace) -> list[Path]:
             raise InputError(f"{motion}: no such file; give {MOTIONS}")
     if isinstance(out := getattr(options, "out", None), Path):
         _require_outside_artifacts(out)
+        if "capture" in options and out.resolve().is_relative_to(options.store.resolve()):
+            raise InputError(f"{out}: lies in the store, where stages write; give another")
         if _recording(options) in out.resolve().parents:
             raise InputError(f"{out}: lies in the recording, whose results would be computed again; give another")
     for option in ("path", "lens"):

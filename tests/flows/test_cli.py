@@ -64,6 +64,8 @@ from tests.shared_data import shared_capture
         ("run absent --set training.field.colour_cells=8,16", "colour_cells: is not a list; write it like [8,16]"),
         ("run absent --set training=8", "training: is a section; give its keys, each with a value"),
         ("run absent --set training.field=8", "training.field: is a section; give its keys, each with"),
+        ("fit . --store results --out results", "results: lies in the store, where stages write; give another"),
+        ("fit . --store results --out results/fit", "results/fit: lies in the store, where stages write; give another"),
         ("synth .", "exists; give the name of a new folder"),
         ("synth ring --set cameras=32", "cameras: no such key; did you mean test_cameras?"),
     ],
