@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import torch
 
 from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import Correctives
@@ -178,13 +177,12 @@ def stage_avatar(
 
 
 def stage_body(body: BodyFit, up: str, fps: float) -> tuple[StagedRig, np.ndarray]:
-    """Return the game rig of a fitted body, with its captured motion alone, and the surface (V, 3) at rest that follows
-    it; `up` and fps as for `stage_avatar`."""
+    """Return the game rig of a fitted body, with its captured motion alone and its root at height 0, and the surface
+    (V, 3) at rest that follows it; `up` and fps as for `stage_avatar`."""
     rest_m, joints_m = _at_rest(body.rig)
     captured = motion_of(body, fps, np.zeros((len(body.frames), 0)), y_up_from(up))
-    floor_m = float((body.vertices_m() @ torch.from_numpy(y_up_from(up)[1]).float()).amin(1).median())
     rest = RestSurface(rest_m, np.zeros((0, *rest_m.shape)))
-    return stage_rigs(body.rig, joints_m, rest, {CAPTURED: captured}, floor_m, "along")[GAME], rest_m
+    return stage_rigs(body.rig, joints_m, rest, {CAPTURED: captured}, 0.0, "along")[GAME], rest_m
 
 
 def _at_rest(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
