@@ -122,8 +122,9 @@ def test_distances_of_rays_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three rays along x, 10, 35 and 0 cm beside the ball's middle, cross the box from 2.9 to 4.1 m. The first hits the
     ball 28 cm before 3.5 m, between its samples, and the third 30 cm before, with a sample in the middle. Their
     distance is 10 / gamma inside. For the first, a change of the ball's y changes it by - 60 cm x 10 / 30 a unit. The
-    second ray is 5 cm from the ball at 3.5 m. The eikonal loss is measured in the box, at .25, .5 and .75 of its edges
-    of 1.2 m."""
+    second ray is 5 cm from the ball at 3.5 m. The point that colours the first, here by its position, moves with the
+    ball along x, and by - 10 / 28 of what the ball moves along y. The eikonal loss is measured in the box, at .25, .5
+    and .75 of its edges of 1.2 m."""
     fit = body()
     settings = load_settings("idr").training.field
     field = IdrField(fit, settings)
@@ -136,12 +137,15 @@ def test_distances_of_rays_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     fine = torch.tensor([[0.25, 0.5, 0.75]] * 3)
     asked, evaluate = [], field._evaluate
     monkeypatch.setattr(field, "_evaluate", lambda points_m: asked.append(points_m) or evaluate(points_m))
+    monkeypatch.setattr(field, "_radiance", lambda points_m, directions: field.scaled(points_m))
     samples, depths = field.sample(field.scene(bodies, conditions), rays, Draws(jitter, 0 * fine, fine, torch.zeros(3)))
     assert samples.alpha.tolist() == [[1.0], [0.0], [1.0]]
     assert depths.flatten().tolist() == pytest.approx([3.5 - 0.08**0.5, 4.1, 3.2], abs=2e-4)
     assert samples.d.flatten().tolist() == pytest.approx([-10 / 50, 0.05, -10 / 50], abs=1e-4)
-    slope = torch.autograd.grad(samples.d[0, 0], field.geometry.middle)[0]
+    slope = torch.autograd.grad(samples.d[0, 0], field.geometry.middle, retain_graph=True)[0]
     assert slope[1].item() == pytest.approx(-0.6 / 3, abs=1e-3)
+    moves = torch.autograd.grad(samples.colour[0, 0, 0], field.geometry.middle)[0]
+    assert moves.tolist() == pytest.approx([1, -0.1 / 0.08**0.5, 0], abs=2e-3)
     torch.testing.assert_close(asked[-1].detach(), torch.tensor([[0.2, 0.5, 0.8]] * 3))
     torch.testing.assert_close(samples.gradient_norm, torch.ones(3))
 
