@@ -121,9 +121,10 @@ def test_codes_of_vertices_in_the_same_voxel_are_averaged() -> None:
 
 
 def test_overfits_two_frames_and_does_not_generalise_to_a_novel_pose(tmp_path: Path) -> None:
-    """Both training frames have 29 dB. Bent by 80 degrees, the novel pose is 3 dB worse: the convolutions see untrained
-    stencils, and there is no prior of the body."""
+    """Both training frames have 29.5 dB, half a decibel more than with convolutions that do not learn. Bent by 80
+    degrees, the novel pose is 3 dB worse: the convolutions see untrained stencils, and there is no prior of the
+    body."""
     learned = learn(tmp_path, load_settings("neural-body", SMALL).training, (0.0, 0.2, 1.4))
     trained = [learned.psnr(frame) for frame in (0, 1)]
-    assert min(trained) > 29
+    assert min(trained) > 29.5
     assert learned.psnr(2) < min(trained) - 3
