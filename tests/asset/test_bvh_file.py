@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hnerf.asset.bvh_file import tips_m, write_body_motion, write_captured_bvh, write_captured_trc
+from hnerf.asset.bvh_file import require_dense, tips_m, write_body_motion, write_captured_bvh, write_captured_trc
 from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.bvh import read_bvh
 from hnerf.body.skeletons import JointNames
 from hnerf.capture.capture import Capture
+from hnerf.errors import InputError
 from tests.asset.figure import FRAMES, bending_body
 
 
@@ -88,6 +89,19 @@ def test_a_fitted_body_moves_as_its_avatar_does(staged: StagedAvatar, tmp_path: 
         pairs = zip(found, expected, strict=True)
         assert [a.split()[0] for a, b in pairs if a != b] == differ
     np.testing.assert_allclose(end_site(tmp_path / "motion.bvh"), [0, 80, 0], atol=1e-4)
+
+
+def test_the_height_of_a_world_with_y_up_is_kept(tmp_path: Path) -> None:
+    """In frame 3 the pelvis is at (0.3, 2, 0.5)."""
+    write_body_motion(tmp_path, dataclasses.replace(recorded(fps=10.0), up="y"), bending_body(), "own")
+    np.testing.assert_allclose(read_bvh(tmp_path / "motion.bvh").positions[0, 0], [30, 200, 50], atol=1e-4)
+
+
+def test_frames_that_are_far_apart_are_refused() -> None:
+    """Four frames, 3 to 8, lie 5 / 3 s apart on average at 1 a second, and 0.67 s at 2.5."""
+    require_dense(recorded(fps=2.5))
+    with pytest.raises(InputError, match=r"ada: frames are more than 0\.7 s apart.*capture\.max_frames"):
+        require_dense(recorded(fps=1.0))
 
 
 def test_the_tip_of_a_joint_is_the_end_of_its_points() -> None:
