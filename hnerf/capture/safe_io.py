@@ -20,7 +20,7 @@ from hnerf.errors import InputError, one_line, raise_if_unreachable
 
 MAX_IMAGE_PIXELS = 36_000_000  # a frame of 8K video has 33 million
 MAX_SIDE_PX = 32_766  # of images that OpenCV can undistort
-MAX_IMAGE_BYTES = 256_000_000  # more than those pixels take uncompressed; anything may follow an image in its file
+MAX_IMAGE_BYTES = 300_000_000  # those pixels take 288 uncompressed, at 16 bits a channel; anything may follow an image
 MAX_TEXT_BYTES = 16_000_000
 MAX_TOML_BYTES = 500_000
 MAX_KEY_PARTS = 16  # of a dotted key in TOML; tomllib's memory and time grow with their square
