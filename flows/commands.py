@@ -154,7 +154,8 @@ def _frame_counts(frames: Sequence[int], fps: float) -> str:
     held = sum(count for count in between if count + 1 > LONGEST_S * fps + 1e-6)
     counts = {"fitted": len(frames), "interpolated": sum(between) - held, f"held in gaps over {LONGEST_S} s": held}
     listed = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-    return f"frames: {frames[0]} to {frames[-1]}, {fps:.4g} a second: {listed}"
+    advice = "; for a pose in every frame, raise capture.max_frames" if sum(between) else ""
+    return f"frames: {frames[0]} to {frames[-1]}, {fps:.4g} a second: {listed}{advice}"
 
 
 def calibrate(options: argparse.Namespace) -> None:

@@ -299,7 +299,7 @@ def write_files(out: Path, avatars: Avatars, capture: Capture, info: AssetInfo, 
     else:
         log.warning(
             "%s: no avatar_24.usda, avatar_30.usda, avatar.bvh and avatar.trc: the captured poses are too far apart to "
-            "be interpolated; list more frames in capture.toml",
+            "be interpolated; raise capture.max_frames or, if capture.toml lists frames, list more",
             capture.name,
         )
     if splats:

@@ -194,7 +194,7 @@ def test_files_at_other_rates_are_left_out_if_poses_are_far_apart(
     assert set(report["validation"]) == {"avatar.usda", "avatar_materialx.usda", "avatar.usdz", "avatar_cache.usdz"}
     assert [r.message for r in caplog.records if "avatar.bvh" in r.message] == [
         "column: no avatar_24.usda, avatar_30.usda, avatar.bvh and avatar.trc: the captured poses are too far apart to "
-        "be interpolated; list more frames in capture.toml"
+        "be interpolated; raise capture.max_frames or, if capture.toml lists frames, list more"
     ]
 
 
