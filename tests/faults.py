@@ -156,6 +156,7 @@ FAULTS = (
     Fault("background-black", "training/step", "rays.colour, drawn)", "rays.colour, 0 * drawn)"),
     # inputs of the networks of `fast`
     Fault("fast-colour-normal", "fields/grids", "positional_encoding(normal, 1)", "positional_encoding(0 * normal, 1)"),
+    Fault("fast-frozen-grids", "fields/fast", "*self.field.colour_grids.parameters()]", "]"),
     Fault("fast-body-normal", "fields/fast", "outward + (found[1:] - found[0]).T / GRADIENT_STEP_M", "outward",
           "fields/fast_ray"),
     Fault("fast-normal-untaught", "fields/fast", "bodies.turn(gradient, row", "bodies.turn(gradient.detach(), row",

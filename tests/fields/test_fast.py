@@ -258,6 +258,14 @@ def test_the_shell_moves_with_the_displacement_of_a_frame():
     torch.testing.assert_close(still - ends(1), torch.tensor([0.05, 0.06]), atol=0.011, rtol=0)
 
 
+def test_every_parameter_learns() -> None:
+    """A column that is overfitted does not show it: networks on frozen grids do so, too."""
+    field = field_of(1000.0)
+    groups = [parameter for group in field.parameter_groups() for parameter in group["params"]]
+    assert len(groups) == len(list(field.parameters()))
+    assert {id(parameter) for parameter in groups} == {id(parameter) for parameter in field.parameters()}
+
+
 def test_training_starts_with_twice_the_spacing():
     """In three quarters of the steps, samples are 2 cm apart, then 1 cm, on paths of up to 64 cm."""
     field = FastField(RIG, SETTINGS, 1)
