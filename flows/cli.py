@@ -211,11 +211,10 @@ def _parser() -> argparse.ArgumentParser:
 
     run = add(commands.run, store, preset)
     run.add_argument("capture", type=path_or_bucket_url, help="capture folder, its URL in a bucket, or one video")
-    _add_overrides(run, "override a setting; `hnerf settings` lists all")
-    add(commands.check_cameras, capture, preset)
-    fit = add(commands.fit, capture, preset)
+    fit, check = add(commands.fit, capture, preset), add(commands.check_cameras, capture, preset)
     _add_out(fit, "motion")
-    _add_overrides(fit, "override a setting; `hnerf settings` lists all")
+    for staged in (run, fit, check):
+        _add_overrides(staged, "override a setting; `hnerf settings` lists all")
     add(commands.settings, preset)
 
     caged = argparse.ArgumentParser(add_help=False)

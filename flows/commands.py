@@ -76,7 +76,7 @@ def check_cameras(options: argparse.Namespace) -> None:
     from tasks.source import read_capture
     from tasks.store import Store
 
-    settings, store = load_settings(options.preset), Store(options.store.resolve())
+    settings, store = load_settings(options.preset, options.overrides), Store(options.store.resolve())
     source, _ = read_capture(options.capture, options.store)
     recording = with_detections(store, ingest_recording(store, source, settings), settings)
     calibration = calibrate(store, recording, settings.calibration)

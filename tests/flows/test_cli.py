@@ -297,9 +297,10 @@ def test_check_cameras_prints_every_camera_and_the_verdict(
 ) -> None:
     for drawn in ("cameras", "evidence"):  # drawing takes seconds
         monkeypatch.setattr(f"hnerf.calibration.report.draw_{drawn}", lambda *_: None)
-    capture, preset = shared_capture("valid-wave"), tmp_path / "no-hands.yaml"
-    preset.write_text("based_on: fast\ndetection: {hands: none}\ncapture: {max_frames: 4, max_side_px: 128}\n")
-    assert main(["check-cameras", str(capture), "--store", str(tmp_path), "--preset", str(preset)]) == 0
+    chosen = [
+        f"--set={setting}" for setting in ("detection.hands=none", "capture.max_frames=4", "capture.max_side_px=128")
+    ]
+    assert main(["check-cameras", str(shared_capture("valid-wave")), "--store", str(tmp_path), *chosen]) == 0
     lines = capsys.readouterr().out.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.startswith("camera ")) :]
     report = json.loads(next(tmp_path.glob("calibration/*/report.json")).read_text())
