@@ -174,9 +174,10 @@ def _require_outside_artifacts(out: Path) -> None:
 
 def _recording(options: argparse.Namespace) -> Path | None:
     """Return the recording that a command reads or whose results it reads; None if it is not known."""
-    for command, recording in ((commands.export_cameras, "folder"), (commands.fit, "capture")):
-        if options.command is command:
-            return Path(getattr(options, recording)).resolve()
+    if options.command is commands.export_cameras:
+        return options.folder.resolve()
+    if options.command is commands.fit:
+        return options.capture.resolve()
     if "name" in options:
         subject = options.store / "subjects" / options.name
     elif "subject" in options:
