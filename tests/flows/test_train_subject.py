@@ -101,6 +101,16 @@ def test_every_stage_is_linked_and_gets_the_results_of_earlier_stages(folder: Pa
     assert given(subject, "asset") == ["capture", "calibration", "segmentation", "training"]
 
 
+def test_what_was_made_before_a_stage_fails_is_linked(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "train", Mock(side_effect=InputError("the surface is empty")))
+    with pytest.raises(InputError, match="the surface is empty"):
+        train_subject.fn(folder, "demo", tmp_path / "store", [])
+    linked = {path.name for path in (tmp_path / "store" / "subjects" / "ada").iterdir() if path.is_symlink()}
+    assert linked == {"capture", "calibration", "segmentation", "fit"}
+
+
 def test_a_field_that_cannot_be_posed_has_no_asset(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
