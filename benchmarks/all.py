@@ -7,7 +7,7 @@ Results that are fresh are skipped, and so are those whose capture is not in `..
 that need a GPU where there is none. Ends with exit code 2 if the checkout has uncommitted changes. After an
 interruption, repeat the same command: finished results are fresh, and an unfinished one finds its finished trainings in
 STORE. A result that fails is reported at the end, with exit code 1, and does not stop the others. `--list` shows the
-state of each result and makes none.
+state of each result, and the stages that have yielded something else since; it makes none.
 """
 
 import fnmatch
@@ -22,7 +22,16 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from freshness import code_digest, file_digests, load_records, result_files, save_record, shown_seconds, stale_reason
+from freshness import (
+    code_digest,
+    file_digests,
+    load_records,
+    raised_stages,
+    result_files,
+    save_record,
+    shown_seconds,
+    stale_reason,
+)
 from provenance import ROOT, arguments, clean_commit, table
 from registry import REGISTRY, Result
 from stopwatch import Stopwatch
@@ -53,12 +62,15 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def listing(root: Path, results: Sequence[Result]) -> list[str]:
-    """Return a table of results: whether each is fresh or why not, and what is recorded about it."""
+    """Return a table of results: whether each is fresh or why not, which of its stages have had their version raised
+    since, and what is recorded about it."""
     records = load_records(root)
-    rows = [["result", "state", "seconds", "code", "commit"]]
+    rows = [["result", "state", "stages raised since", "seconds", "code", "commit"]]
     for result in results:
-        why, record = stale_reason(root, result, records), records.get(result.name)
-        known = [shown_seconds(record), record["digest"][:12], record["commit"]] if record else ["-", "-", "-"]
+        why, record, known = stale_reason(root, result, records), records.get(result.name), ["-"] * 4
+        if record:
+            raised = raised_stages(root, result, record["commit"])
+            known = [raised, shown_seconds(record), record["digest"][:12], record["commit"]]
         rows.append([result.name, f"stale: {why}" if why else "fresh", *known])
     return table(rows)
 

@@ -9,6 +9,7 @@ import ast
 import hashlib
 import json
 import re
+import subprocess
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -22,6 +23,7 @@ from hnerf.files import replace_text
 from hnerf.study.machine import describe_machine
 
 MODULE = re.compile(r"[a-z]\w*(\.\w+)+")  # modules that are started by name, like the ranks of a training
+STAGE = re.compile(r'@stage\("([\w-]+)", version="(\d+)"')
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 Records = dict[str, dict[str, Any]]
 
@@ -68,6 +70,15 @@ def stale_reason(root: Path, result: Result, records: Records) -> str | None:
     return f"{changed[0]} has changed since it was made" if changed else None
 
 
+def raised_stages(root: Path, result: Result, commit: str) -> str:
+    """Return the stages that the result runs and whose version differs between a commit and HEAD, with both versions:
+    of all stages, only they yield something else now. "none" if no version differs, "-" if the result runs no stage."""
+    tasks = [str(path.relative_to(root)) for path in sources(root, result) if path.parent == root / "tasks"]
+    was, now = (_stage_versions(root, at, tasks) for at in (commit, "HEAD"))
+    raised = [f"{name} {was.get(name, '-')} → {now[name]}" for name in sorted(now) if now[name] != was.get(name)]
+    return ", ".join(raised) or ("none" if now else "-")
+
+
 def file_digests(root: Path, result: Result) -> dict[str, str]:
     """Return the SHA-256 of each existing file of the result."""
     return {
@@ -104,6 +115,14 @@ def save_record(root: Path, name: str, record: dict[str, Any]) -> None:
 def shown_seconds(record: dict[str, Any]) -> str:
     """Format the seconds that the result took when it was last made from scratch."""
     return "-" if record["seconds"] is None else f"{record['seconds']:.0f}"
+
+
+def _stage_versions(root: Path, commit: str, files: list[str]) -> dict[str, str]:
+    """Return the version of each stage that these files declare at a commit, by its name."""
+    if not files:
+        return {}
+    command = ["git", "-C", str(root), "grep", "--no-color", "-h", "@stage", commit, "--", *files]
+    return dict(STAGE.findall(subprocess.run(command, capture_output=True, text=True).stdout))
 
 
 def _files(base: Path, module: str) -> Iterator[Path]:

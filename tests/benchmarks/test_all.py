@@ -173,8 +173,24 @@ def test_the_list_shows_which_results_are_fresh_and_why_others_are_not(checkout:
     make(checkout.root, [ONE], checkout.store, 1)
     record = load_records(checkout.root)["one"]
     lines = module.listing(checkout.root, [ONE, TWO])
-    assert lines[2] == f"| one | fresh | {record['seconds']:.0f} | {record['digest'][:12]} | {record['commit']} |"
-    assert lines[3] == "| two | stale: not recorded | - | - | - |"
+    known = f"{record['seconds']:.0f} | {record['digest'][:12]} | {record['commit']}"
+    assert lines[2] == f"| one | fresh | - | {known} |"
+    assert lines[3] == "| two | stale: not recorded | - | - | - | - |"
+
+
+def test_the_list_shows_the_stages_that_have_had_their_version_raised(checkout: Checkout) -> None:
+    """Other changes of the code leave what a stage yields as it was."""
+    checkout.write("hnerf/far.py", "def work():\n    from tasks import fit\n\n\nNUMBER = 1\n")
+    stages = '@stage("fit", version="9")\ndef fit():\n    pass\n\n\n@stage("hands", version="3", networks=())\n'
+    checkout.write("tasks/fit.py", f"{stages}def hands():\n    pass\n")
+    checkout.write("tasks/unused.py", '@stage("unused", version="1")\ndef unused():\n    pass\n')
+    checkout.commit()
+    make(checkout.root, [ONE], checkout.store, 1)
+    assert " | none | " in module.listing(checkout.root, [ONE])[2]
+    for path in (checkout.root / "tasks").iterdir():
+        path.write_text(path.read_text().replace("9", "10").replace('"1"', '"2"'))
+    checkout.commit()
+    assert "| one | stale: its code has changed | fit 9 → 10 | " in module.listing(checkout.root, [ONE])[2]
 
 
 def test_an_unknown_name_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
