@@ -165,7 +165,7 @@ def _image_cell(found: dict[str, Any]) -> str:
 
 
 def _cost_table(captures: dict[str, Any]) -> list[str]:
-    costs = ["setup, s", "training, s", "of that the field, s", "device", "one image, s", "whole run, s"]
+    costs = ["setup, s", "training, s", "of that the field, s", "device", "rendering, s per image", "whole run, s"]
     rows = [["capture", "limb joints, mm", *costs]]
     for name, figures in captures.items():
         fit = (figures["score"] or {}).get("fit")
