@@ -348,7 +348,7 @@ FAULTS = (
     Fault("cloth-aligned", "body/clothed_fit", "keep = aligned & (", "keep = ("),
     # input: capture formats, segmentation, clocks
     Fault("colmap-pixel-centre", "capture/formats/colmap", "cx - PIXEL_CENTRE", "cx", "capture/formats/camera_files"),
-    Fault("colmap-distortion", "capture/formats/colmap", "=optics.values[4:9]", "=optics.values[5:9]",
+    Fault("colmap-distortion", "capture/formats/colmap", "else optics.values[4:9]", "else optics.values[5:9]",
           "capture/formats/camera_files"),
     Fault("zjumocap-unit", "capture/formats/zjumocap", "METRES_PER_UNIT = 1e-3", "METRES_PER_UNIT = 1.0"),
     Fault("ingest-stated-rate", "capture/ingest", "        return stated or counted", "        return counted",

@@ -21,8 +21,8 @@ MAX_OFF_PX = 1.0  # between a recorded pixel and the projection of the ray that 
 
 @dataclass(frozen=True)
 class Lens:
-    """A calibrated camera with lens distortion: K (3, 3) pixels; distortion (4,) or (5,), OpenCV's k1 k2 p1 p2 [k3]; R
-    (3, 3), t_m (3,) world to camera.
+    """A calibrated camera with lens distortion: K (3, 3) pixels; distortion (4,), (5,) or (8,), OpenCV's k1 k2 p1 p2
+    [k3 [k4 k5 k6]]; R (3, 3), t_m (3,) world to camera.
 
     `size_px` is the (width, height) that was calibrated, None if the file does not say; `estimated`: whether
     K comes from an angle or from the person, not from a file of intrinsics.
@@ -105,12 +105,13 @@ def checked_lens(
     camera, extrinsics = check_camera_name(name, source), extrinsics or source
     for file, label, value, sizes in (
         (source, "K", K, (9,)),
-        (source, "distortion", distortion, (4, 5)),
+        (source, "distortion", distortion, (4, 5, 8)),
         (extrinsics, "R", R, (3, 9)),
         (extrinsics, "T", t_m, (3,)),
     ):
         if value.size not in sizes:
-            raise InputError(f"{file}: camera {camera}: {label} has {value.size} numbers; calibrate again")
+            right = " or ".join(map(str, sizes))
+            raise InputError(f"{file}: camera {camera}: {label} has {value.size} numbers, not {right}; calibrate again")
         if not np.isfinite(value).all():
             raise InputError(f"{file}: camera {camera}: {label} holds a NaN or infinity; calibrate again")
         if np.abs(value).max() > MAX_NUMBER:

@@ -22,6 +22,16 @@ def test_undistortion_of_a_wide_lens_is_exact_in_the_corners(focal_px: float, k1
     np.testing.assert_allclose(undistort_points(bent, K, distortion), straight, atol=0.01)
 
 
+def test_a_rational_lens_is_undistorted_by_hand() -> None:
+    """Radius 1 is imaged at (1 + 0.5) / (1 + 0.25) = 1.2: pixel 50 + 120 is 50 + 100. With k4 = 1, r is at r / (1 +
+    r^2): 0.75 at 0.48, and none beyond 0.5; 0.6 is beyond that."""
+    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    straight = undistort_points(np.array([[170.0, 50]]), K, np.array([0.5, 0, 0, 0, 0, 0.25, 0, 0]))
+    assert straight[0].tolist() == pytest.approx([150, 50], abs=0.01)
+    near, beyond = undistort_points(np.array([[98.0, 50], [110, 50]]), K, np.array([0.0, 0, 0, 0, 0, 1, 0, 0]))
+    assert near.tolist() == pytest.approx([125, 50], abs=0.01) and np.isnan(beyond).all()
+
+
 def test_keypoints_that_no_ray_reaches_are_missing() -> None:
     """The lens images radius r at r (1 - 0.3 r^2): 0.5 at 0.4625, and nothing beyond 0.703; 0.8 is beyond that."""
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])

@@ -38,6 +38,12 @@ def test_skew_is_accepted_only_without_distortion(skew: float, k1: float, refuse
         checked_lens(Path("intri.yml"), "a", K, distortion, np.eye(3), np.zeros(3), None)
 
 
+@pytest.mark.parametrize("count", [3, 6, 7, 9])
+def test_a_distortion_of_another_model_is_refused(count: int) -> None:
+    with pytest.raises(InputError, match=rf"camera a: distortion has {count} numbers, not 4 or 5 or 8; calibrate"):
+        checked_lens(Path("intri.yml"), "a", np.eye(3), np.zeros(count), np.eye(3), np.zeros(3), None)
+
+
 def test_a_decomposed_folder_name_is_composed() -> None:
     composed, decomposed = "J\u00fcrgen", "Ju\u0308rgen"
     assert capture_name(Path("/recordings") / decomposed, CaptureManifest()) == composed

@@ -107,13 +107,11 @@ def _colmap_parameters(lens: Lens) -> tuple[str, list[float]]:
         return "PINHOLE", linear
     if not any(distortion[4:]):
         return "OPENCV", linear + distortion[:4]
-    return "FULL_OPENCV", [*linear, *distortion, 0.0, 0.0, 0.0]
+    return "FULL_OPENCV", [*linear, *distortion, *[0.0] * (8 - len(distortion))]
 
 
 def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
     """Return the lens of one image. Raises InputError if its camera cannot be used."""
-    if optics.values[9:].any():
-        raise InputError(f"{sources[0]}: camera {shot.camera_id}: k4 to k6 are not supported; undistort its images")
     fx, fy, cx, cy = optics.values[:4]
     quaternion = np.array(shot.pose[:4])
     norm = np.linalg.norm(quaternion)
@@ -123,7 +121,7 @@ def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
         source=sources[0],
         name=check_camera_name(PurePosixPath(shot.name.split("/")[0]).stem, sources[1]),
         K=np.array([[fx, 0, cx - PIXEL_CENTRE], [0, fy, cy - PIXEL_CENTRE], [0, 0, 1]]),
-        distortion=optics.values[4:9],
+        distortion=optics.values[4:] if optics.values[9:].any() else optics.values[4:9],
         R=Rotation.from_quat(quaternion / norm, scalar_first=True).as_matrix(),
         t_m=np.array(shot.pose[4:]),
         size_px=optics.size_px,

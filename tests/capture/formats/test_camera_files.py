@@ -35,6 +35,8 @@ LENSES = [
     Lens("cam_3", np.array([[20.0, 0, 11.5], [0, 20, 7.5], [0, 0, 1]]), np.array([0.1, -0.2, 0.01, 0.02]),
          cv2.Rodrigues(np.array([0.1, 0.2, 0.3]))[0], np.array([0.0, 0, 4]), (24, 16)),
     Lens("cam_4", np.array([[20.0, 0, 11.5], [0, 20, 7.5], [0, 0, 1]]), np.zeros(4), np.eye(3), np.zeros(3), (24, 16)),
+    Lens("cam_5", np.array([[20.0, 0, 11.5], [0, 20, 7.5], [0, 0, 1]]), np.array([0.5, 0, 0, 0.01, 0, 0.25, 0, 0.1]),
+         np.eye(3), np.zeros(3), (24, 16)),
 ]  # fmt: skip
 
 
@@ -126,11 +128,10 @@ def test_inconsistent_colmap_models_are_refused(old: str, new: str, message: str
         Colmap(tmp_path).lenses()
 
 
-def test_a_colmap_lens_with_a_fourth_radial_term_is_refused(tmp_path: Path) -> None:
-    simple, full = "SIMPLE_RADIAL 640 480 500 320 240 0.1", "FULL_OPENCV 640 480 500 500 320 240 0 0 0 0 0 0.1 0 0"
+def test_a_rational_colmap_lens_is_read(tmp_path: Path) -> None:
+    simple, full = "SIMPLE_RADIAL 640 480 500 320 240 0.1", "FULL_OPENCV 640 480 500 500 320 240 1 2 3 4 5 6 7 8"
     (write_model(tmp_path) / "sparse" / "0" / "cameras.txt").write_text(CAMERAS_TXT.replace(simple, full))
-    with pytest.raises(InputError, match=r"cameras\.txt: camera 1: k4 to k6 are not supported"):
-        Colmap(tmp_path).lenses()
+    assert Colmap(tmp_path).lenses()["01"].distortion.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
 
 
 @pytest.mark.parametrize(
@@ -141,12 +142,12 @@ def test_written_cameras_are_read_back(layout: str, reader: type[Layout], tmp_pa
     write_cameras(tmp_path, LENSES, layout)
     assert type(recognise(tmp_path)) is reader
     read = recognise(tmp_path).lenses()
-    assert list(read) == ["cam_0", "cam_3", "cam_4"]
+    assert list(read) == [lens.name for lens in LENSES]
     for lens in LENSES:
         found = read[lens.name]
         assert np.allclose(found.K, lens.K, atol=1e-12) and found.size_px == lens.size_px
         assert np.allclose(found.R, lens.R, atol=1e-12) and np.allclose(found.t_m, lens.t_m, atol=1e-12)
-        padded = [np.pad(d, (0, 5 - len(d))) for d in (found.distortion, lens.distortion)]
+        padded = [np.pad(d, (0, 8 - len(d))) for d in (found.distortion, lens.distortion)]
         assert np.allclose(*padded, atol=1e-12)
 
 
@@ -171,7 +172,7 @@ def test_formats_that_require_an_image_size_are_not_written_without_one(layout: 
 
 def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path) -> None:
     names = ("cam_01", "cam_08", "cam_10")
-    write_cameras(tmp_path, [dataclasses.replace(a, name=b) for a, b in zip(LENSES, names, strict=True)], "caliscope")
+    write_cameras(tmp_path, [dataclasses.replace(a, name=b) for a, b in zip(LENSES, names, strict=False)], "caliscope")
     assert list(recognise(tmp_path).lenses()) == ["cam_0", "cam_1", "cam_2"]
 
 
@@ -190,13 +191,13 @@ def test_colmap_projects_to_the_same_pixels(tmp_path: Path) -> None:
     """A point that projects to pixel (319.5, 239.5) here projects to (320, 240) there."""
     write_cameras(tmp_path, LENSES, "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
-    assert [model.cameras[i].model.name for i in (1, 2, 3)] == ["FULL_OPENCV", "OPENCV", "PINHOLE"]
-    image = next(image for image in model.images.values() if image.name == "cam_0/000000.jpg")
+    assert [model.cameras[i].model.name for i in (1, 2, 3, 4)] == ["FULL_OPENCV", "OPENCV", "PINHOLE", "FULL_OPENCV"]
     on_axis = LENSES[0].R.T @ (np.array([0, 0, 2.0]) - LENSES[0].t_m)
-    assert image.project_point(on_axis).tolist() == pytest.approx([320, 240])
+    assert model.image(1).project_point(on_axis).tolist() == pytest.approx([320, 240])
     beside = np.array([0.3, 0.2, 2.0])
-    uv = cv2.projectPoints(beside, np.zeros(3), np.zeros(3), LENSES[0].K, LENSES[0].distortion)[0].ravel()
-    assert image.project_point(LENSES[0].R.T @ (beside - LENSES[0].t_m)) == pytest.approx(uv + 0.5)
+    for number, lens in enumerate(LENSES, start=1):
+        uv = cv2.projectPoints(beside, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0].ravel()
+        assert model.image(number).project_point(lens.R.T @ (beside - lens.t_m)) == pytest.approx(uv + 0.5)
 
 
 def test_opencv_and_pose2sim_read_what_is_written(tmp_path: Path) -> None:
@@ -212,7 +213,7 @@ def test_caliscope_cameras_marked_as_ignored_are_left_out(tmp_path: Path) -> Non
     write_cameras(tmp_path, LENSES, "caliscope")
     text = (tmp_path / "camera_array.toml").read_text().replace("ignore = false", "ignore = true", 1)
     (tmp_path / "camera_array.toml").write_text(text)
-    assert list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4"]
+    assert list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4", "cam_5"]
     for name in ("../3", "cam 3 "):  # OpenCV, which stores the cameras in use, drops a space at the end
         (tmp_path / "camera_array.toml").write_text(text.replace("cam_id = 3", f'cam_id = "{name}"'))
         with pytest.raises(InputError, match="camera name"):
@@ -231,7 +232,7 @@ def test_caliscope_cameras_without_a_pose_are_left_out(tmp_path: Path, caplog: p
     with pytest.raises(InputError, match="camera 0: 'rotation' is missing"):
         recognise(tmp_path).lenses()
     (tmp_path / "camera_array.toml").write_text(without_rotation.replace("translation = ", "# ", 1))
-    assert not caplog.messages and list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4"]
+    assert not caplog.messages and list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4", "cam_5"]
     file = tmp_path / "camera_array.toml"
     assert caplog.messages == [f"{file}: left out, since they have no rotation and translation: 'cam_0'"]
 
