@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hnerf.capture.lens import undistort_keypoints
+from hnerf.capture.lens import pinhole, undistort_keypoints
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import reprojection_px, triangulate
@@ -77,7 +77,8 @@ def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], unknown: Sequenc
     for i, camera in enumerate(cameras):
         if camera.name in unknown and k1:
             seen = keypoints[i, ..., 2] > 0
-            straight[i, seen] = undistort_keypoints(keypoints[i, seen], camera.K, np.array([k1, 0, 0, 0]))
+            lens = dataclasses.replace(pinhole(camera), distortion=np.array([k1, 0, 0, 0]))
+            straight[i, seen] = undistort_keypoints(keypoints[i, seen], lens)
     return straight
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from hnerf.capture.bars import Area
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.capture.given_poses import GivenPoses
-from hnerf.capture.lens import checked_lens
+from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import IMAGE_SUFFIXES, check_image_size
 from hnerf.capture.timing import median_step, nearest_frame, resample
 from hnerf.errors import InputError, raise_if_unreachable
@@ -41,6 +41,14 @@ class SubjectPoint(NamedTuple):
     frame: int = 0
 
 
+StoredLens = tuple[list[list[float]], list[float], *tuple[bool, ...]]  # K, distortion and, of a fisheye, True
+
+
+def stored_lens(lens: Lens) -> StoredLens:
+    """Return what `capture.json` holds of a lens."""
+    return lens.K.tolist(), lens.distortion.tolist(), *[True] * lens.fisheye
+
+
 @dataclass(frozen=True)
 class Capture:
     """A normalised capture: cameras, frames, splits and where the images lie. Test cameras are for scoring only.
@@ -50,7 +58,7 @@ class Capture:
     picture fills, if black bars prove it; ingestion changed K accordingly. `up`: "z" or "y", the world's vertical axis.
     `frame_offsets`: of cameras that are not synchronised (hnerf.capture.timing); `stored_frames`: the frames in the
     files, if some were dropped since; `frame_step`: the distance of frame numbers in the recording. `recorded_lenses`:
-    K and distortion of the recorded files, for cameras that were undistorted. `subject_point`: None if nobody is named.
+    `stored_lens` of the recorded files, for cameras that were undistorted. `subject_point`: None if nobody is named.
     `stature_m`: the person's, if `capture.toml` states it. `notes`: how cameras and clocks were found, for the report.
     """
 
@@ -69,7 +77,7 @@ class Capture:
     frame_offsets: dict[str, float] = dataclasses.field(default_factory=dict)
     stored_frames: tuple[int, ...] = ()
     frame_step: int = 1
-    recorded_lenses: dict[str, tuple[list[list[float]], list[float]]] = dataclasses.field(default_factory=dict)
+    recorded_lenses: dict[str, StoredLens] = dataclasses.field(default_factory=dict)
     subject_point: SubjectPoint | None = None
     stature_m: float | None = None
     notes: tuple[str, ...] = ()
@@ -78,6 +86,14 @@ class Capture:
     def frames(self) -> tuple[int, ...]:
         """Return every frame for which a pose is needed, ascending."""
         return tuple(sorted(set(self.train_frames) | set(self.novel_pose_frames)))
+
+    def recorded_lens(self, camera: str) -> Lens | None:
+        """Return the lens of a camera's recorded files; None if they were not undistorted."""
+        if camera not in self.recorded_lenses:
+            return None
+        K, distortion, *fisheye = self.recorded_lenses[camera]
+        posed, size_px = self.cameras[camera], self.recorded_sizes_px[camera]
+        return Lens(camera, np.array(K), np.array(distortion), posed.R, posed.t_m, size_px, fisheye=any(fisheye))
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """Read the image recorded nearest in time to a frame, (H, W, 3) uint8 RGB. Raises InputError without one."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
-from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, Capture, SubjectPoint
+from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, Capture, SubjectPoint, stored_lens
 from hnerf.capture.clocks import RATE_TOLERANCE, InStep, in_step, warn_if_uneven
 from hnerf.capture.footage import Footage, Video, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
@@ -140,7 +140,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, layout: Layout | 
         subject_point=_subject_point(manifest, normalisers, wanted),
         stature_m=manifest.stature_m,
         notes=tuple(layout.notes()),
-        recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
+        recorded_lenses={name: stored_lens(n.lens) for name, n in normalisers.items() if n.maps},
     )
     capture.save()
     return capture
@@ -388,7 +388,7 @@ def _write_masks(normaliser: Normaliser, masks: dict[int, StoredFrame], out: Pat
 def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> None:
     """Raise InputError if most of the undistorted image of (width, height) pixels was never recorded. Warn if it lacks
     much of what was."""
-    if not np.any(lens.distortion):
+    if not lens.distorts:
         return
     if (kept := kept_share(lens, size_px)) < MIN_KEPT_SHARE:
         raise InputError(

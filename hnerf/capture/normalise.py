@@ -39,8 +39,9 @@ class Normaliser:
         if scale < 1:
             camera = camera.scaled(scale)
         maps = None
-        if np.any(lens.distortion):
-            maps = cv2.initUndistortRectifyMap(lens.K, lens.distortion, None, lens.K, recorded_size_px, cv2.CV_16SC2)
+        if lens.distorts:
+            rectify = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+            maps = rectify(lens.K, lens.distortion, np.eye(3), lens.K, recorded_size_px, cv2.CV_16SC2)
         return Normaliser(lens, camera, recorded_size_px, maps)
 
     def pixels(self, recorded: np.ndarray) -> np.ndarray:
@@ -55,7 +56,7 @@ class Normaliser:
         """Convert recorded keypoints (..., 3) x_px, y_px, confidence to the linear camera; points without
         confidence, and those outside the lens's valid image area, become zero."""
         if self.maps is not None:
-            recorded = undistort_keypoints(recorded, self.lens.K, self.lens.distortion)
+            recorded = undistort_keypoints(recorded, self.lens)
         scale = np.array(self.camera.size_px) / self.recorded_size_px
         xy = recorded[..., :2] * scale + (scale - 1) / 2  # pixel centres at integers
         return np.concatenate([xy, recorded[..., 2:]], -1) * (recorded[..., 2:] > 0)
@@ -111,13 +112,13 @@ def has_soft_edges(mask: np.ndarray, source: Path) -> bool:
 def kept_share(lens: Lens, size_px: tuple[int, int]) -> float:
     """Return the share of an undistorted image of (width, height) pixels that the recorded image covers, from GRID x
     GRID samples."""
-    return float(_inside(distort_points(_samples(size_px), lens.K, lens.distortion), size_px).mean())
+    return float(_inside(distort_points(_samples(size_px), lens), size_px).mean())
 
 
 def lost_share(lens: Lens, size_px: tuple[int, int]) -> float:
     """Return the share of a recorded image of (width, height) pixels that is beyond the borders of the undistorted
     image, from GRID x GRID samples."""
-    at_px = undistort_points(_samples(size_px), lens.K, lens.distortion)  # NaN beyond the model
+    at_px = undistort_points(_samples(size_px), lens)  # NaN beyond the model
     return float(1 - _inside(at_px, size_px).mean())
 
 

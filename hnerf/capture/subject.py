@@ -134,7 +134,7 @@ def _place(capture: Capture, *people: PersonTrack) -> str:
     for person in people:
         keypoints = person.keypoints[c, frame]
         x, y, _ = to_recorded @ [*np.median(keypoints[keypoints[:, 2] > 0, :2], axis=0), 1]
-        if lens := capture.recorded_lenses.get(camera.name):
-            ((x, y),) = distort_points(np.array([[x, y]]), *map(np.array, lens))
+        if lens := capture.recorded_lens(camera.name):
+            ((x, y),) = distort_points(np.array([[x, y]]), lens)
         places.append(f"({x:.0f}, {y:.0f})")
     return f"at {' and '.join(places)} in camera {camera.name}, frame {capture.frames[frame]}"

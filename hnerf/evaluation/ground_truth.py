@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 
 from hnerf.capture.capture import Capture
-from hnerf.capture.lens import Lens
 from hnerf.capture.masks import Masks
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, path_in_capture, read_arrays, read_image
@@ -89,15 +88,14 @@ class GroundTruth:
         Raises InputError otherwise."""
         size = self.capture.cameras[camera].size_px
         recorded_px = self.capture.recorded_sizes_px.get(camera)
-        if camera in self.capture.recorded_lenses and image.shape[1::-1] == recorded_px:
-            K, distortion = map(np.array, self.capture.recorded_lenses[camera])
-            lens = Lens(camera, K, distortion, np.eye(3), np.zeros(3), recorded_px)
+        lens = self.capture.recorded_lens(camera)
+        if lens and image.shape[1::-1] == recorded_px:
             return Normaliser.create(lens, recorded_px, max(size)).pixels(image)
         width_px, height_px = given = image.shape[1::-1]
         if given == size:
             return image
         stretched = abs(width_px * size[1] - height_px * size[0]) > max(given)  # by more than rounding
-        if camera in self.capture.recorded_lenses or (stretched and given != recorded_px):
+        if lens or (stretched and given != recorded_px):
             raise InputError(
                 f"{path}: is {width_px} x {height_px} px, unlike camera {camera}; give it at the recording's size"
             )

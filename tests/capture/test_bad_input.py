@@ -269,7 +269,17 @@ POSE2SIM = {
         _edited(TABLES, 'name = "cam02"', 'name = "cam01"'),
         "Calib.toml: two cameras are called cam01",
     ),
-    "fisheye": (_edited(TABLES, "fisheye = false", "fisheye = true"), "fisheye"),
+    "fisheye of five coefficients": (
+        lambda f: [
+            _edited(TABLES, "distortions = [0.0,", "distortions = [0.0, 0.0,")(f),
+            _edited(TABLES, "fisheye = false", "fisheye = true")(f),
+        ],
+        "Calib.toml: camera cam01: distortion has 5 numbers, not 4",
+    ),
+    "fisheye is a text": (
+        _edited(TABLES, "fisheye = false", 'fisheye = "false"'),
+        "Calib.toml: camera cam01: its table, or",
+    ),
     "video missing": (lambda f: (f / "videos/cam02.mp4").unlink(), "images/cam02: no JPEG or PNG"),
     "two videos of one camera": (
         lambda f: shutil.copy(f / "videos/cam02.mp4", f / "videos/cam02.MOV"),

@@ -11,7 +11,9 @@ import pytest
 from PIL import Image
 
 from hnerf.capture.capture import Capture, write_image
+from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.ingest import ingest
+from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import read_manifest
 from hnerf.capture.video_metadata import is_hdr
 from hnerf.config import CaptureSettings
@@ -268,6 +270,39 @@ def test_a_distorted_recording_is_undistorted(folder: Path, tmp_path: Path) -> N
     expected = 10 * (11.5 + 7.5 * (1 - 0.5 * (0.375**2 + 0.025**2)))
     assert capture.image("01", 0)[7, 19] == pytest.approx([expected] * 3, abs=2.5)  # remap rounds to 1/32 px; JPEG
     assert np.array_equal(capture.cameras["01"].K, np.array(rec.K))
+
+
+def test_a_straight_line_before_a_fisheye_is_ingested_straight(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An equidistant lens of 40 px sees an edge along x = 0.5 + 0.2 y, white on its right, which is at straight pixel
+    59.5 + 40 x. The half-width of 60 px is 86 degrees wide, of which the straight image keeps 56; a keypoint at 45
+    degrees, 40 pi / 4 px from the middle, moves to 40 px."""
+    folder = rec.write_easymocap(tmp_path / "ada")
+    lenses = [Lens(n, np.array([[40.0, 0, 59.5], [0, 40, 44.5], [0, 0, 1]]), np.zeros(4), np.array(rec.ROTATIONS[n]),
+                   np.array(rec.TRANSLATIONS_M[n]), (120, 90), fisheye=True) for n in rec.CAMERAS]  # fmt: skip
+    (folder / "extri.yml").unlink()
+    write_cameras(folder, lenses, "aniposelib")
+    x, y = np.meshgrid((np.arange(120) - 59.5) / 40, (np.arange(90) - 44.5) / 40)
+    angle = np.hypot(x, y)
+    across_px = np.clip(40 * (np.tan(np.minimum(angle, 1.55)) / angle * (x - 0.2 * y) - 0.5), -9, 9)
+    grey = np.repeat(255 / (1 + np.exp(-across_px))[..., None], 3, -1).astype(np.uint8)
+    for camera in rec.CAMERAS:
+        for frame in rec.FRAMES:
+            write_image(folder / "images" / camera / f"{frame:06d}.png", grey)
+            points = np.tile([59.5 + 10 * np.pi, 44.5, 0.9], (25, 1))
+            rec.write_keypoints(folder / "openpose" / camera / f"{frame:06d}_keypoints.json", [points])
+    ingest(folder, SETTINGS, tmp_path / "out")
+    capture = Capture.load(tmp_path / "out")
+    rows = capture.image("01", 0)[..., 0].astype(float)
+    edge = np.array([np.interp(127.5, row[60:110], np.arange(60, 110)) for row in rows])
+    expected = 59.5 + 40 * 0.5 + 0.2 * (np.arange(90) - 44.5)
+    assert np.abs(edge - expected).max() < 0.3 and np.abs(expected - np.mean(expected)).max() > 8
+    keypoints, lens = capture.keypoints("01"), capture.recorded_lens("01")
+    assert keypoints is not None and keypoints[0, 0, 0] == pytest.approx([99.5, 44.5, 0.9], abs=1e-3)
+    assert lens is not None and lens.fisheye and lens.K.tolist() == lenses[0].K.tolist()
+    assert np.array_equal(capture.cameras["01"].K, lenses[0].K)
+    assert sum("cuts off the borders" in message for message in caplog.messages) == 2
 
 
 def test_undistortion_that_cuts_off_much_of_the_picture_gets_a_warning(

@@ -31,17 +31,27 @@ def test_lost_share_by_hand() -> None:
     assert lost_share(lens, (32, 1)) == pytest.approx(1 - 0.873, abs=0.01)
 
 
-@pytest.mark.parametrize(("skew", "k1", "refused"), [(12.0, -0.1, True), (1e-9, -0.1, False), (12.0, 0.0, False)])
-def test_skew_is_accepted_only_without_distortion(skew: float, k1: float, refused: bool) -> None:
+@pytest.mark.parametrize(
+    ("skew", "k1", "fisheye", "refused"),
+    [
+        (12.0, -0.1, False, True),
+        (1e-9, -0.1, False, False),
+        (12.0, 0.0, False, False),
+        (12.0, 0.0, True, True),
+        (1e-9, 0.0, True, False),
+    ],
+)
+def test_skew_is_accepted_only_without_distortion(skew: float, k1: float, fisheye: bool, refused: bool) -> None:
     K, distortion = np.array([[800.0, skew, 499.5], [0, 800, 499.5], [0, 0, 1]]), np.array([k1, 0, 0, 0])
     with pytest.raises(InputError, match=r"intri\.yml: camera a: has both skew") if refused else nullcontext():
-        checked_lens(Path("intri.yml"), "a", K, distortion, np.eye(3), np.zeros(3), None)
+        checked_lens(Path("intri.yml"), "a", K, distortion, np.eye(3), np.zeros(3), None, fisheye=fisheye)
 
 
 @pytest.mark.parametrize("count", [3, 6, 7, 9])
 def test_a_distortion_of_another_model_is_refused(count: int) -> None:
-    with pytest.raises(InputError, match=rf"camera a: distortion has {count} numbers, not 4 or 5 or 8; calibrate"):
-        checked_lens(Path("intri.yml"), "a", np.eye(3), np.zeros(count), np.eye(3), np.zeros(3), None)
+    for fisheye, right in ((False, "4 or 5 or 8"), (True, "4")):
+        with pytest.raises(InputError, match=rf"camera a: distortion has {count} numbers, not {right}; calibrate"):
+            checked_lens(Path("a.toml"), "a", np.eye(3), np.zeros(count), np.eye(3), np.zeros(3), None, fisheye=fisheye)
 
 
 def test_a_decomposed_folder_name_is_composed() -> None:

@@ -100,12 +100,13 @@ def test_a_lens_file_takes_precedence(tmp_path: Path, name: str) -> None:
         write_images(tmp_path, camera)
     matrix = "K_a: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [150, 0, 99, 0, 150, 49, 0, 0, 1]\n"
     table = '[a]\nname = "a"\nsize = [200, 100]\nmatrix = [[150, 0, 99], [0, 150, 49], [0, 0, 1]]\n'
-    table += "distortions = [0.1, 0, 0, 0]\n"
+    table += "distortions = [0.1, 0, 0, 0]\nfisheye = true\n"
     file = tmp_path / name
     file.write_text(f"%YAML:1.0\n---\nnames:\n  - a\n{matrix}" if name == "intri.yml" else table)
     known = Uncalibrated(tmp_path, file, 90).known_lenses
     assert known["a"].lens.K[0].tolist() == [150, 0, 99] and known["a"].source == f"from {name}"
     assert known["a"].lens.t_m.tolist() == [0, 0, 0] and known["b"].source == "90 degrees given"
+    assert known["a"].lens.fisheye == (name == "lenses.toml")
 
 
 def test_lenses_that_a_calibration_estimated_are_used_only_if_their_file_is_named(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hnerf.capture.capture import write_image
+from hnerf.capture.capture import stored_lens, write_image
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
 from hnerf.errors import InputError
@@ -81,17 +81,15 @@ def test_truth_is_synchronised_with_the_photograph(truth: GroundTruth) -> None:
     assert synchronised.on_black("c", 1)[0].max() == 90
 
 
-def test_truth_is_undistorted_like_photographs(truth: GroundTruth) -> None:
+@pytest.mark.parametrize(("fisheye", "terms"), [(False, [0.0, 0.0, 0.5, 0.5]), (True, [5.0, 0.0, 0.0, 0.0])])
+def test_truth_is_undistorted_like_photographs(truth: GroundTruth, fisheye: bool, terms: list[float]) -> None:
     """Compare with the Normaliser that ingest applies to photographs; lens distortion moves the outline."""
     camera = truth.capture.cameras["c"]
     size_px = (camera.width_px, camera.height_px)
-    distortion = np.array([0.0, 0.0, 0.5, 0.5])
     straight = truth.mask("c", 1)
-    bent = replace(
-        truth.capture, recorded_sizes_px={"c": size_px}, recorded_lenses={"c": (camera.K.tolist(), distortion.tolist())}
-    )
+    lens = Lens("c", camera.K, np.array(terms), np.eye(3), np.zeros(3), size_px, fisheye=fisheye)
+    bent = replace(truth.capture, recorded_sizes_px={"c": size_px}, recorded_lenses={"c": stored_lens(lens)})
     found = replace(truth, capture=bent).mask("c", 1)
-    lens = Lens("c", camera.K, distortion, np.eye(3), np.zeros(3), size_px)
     expected = Normaliser.create(lens, size_px, max(size_px)).pixels(255 * straight.astype(np.uint8)) > 127
     assert np.array_equal(found, expected) and not np.array_equal(found, straight)
 

@@ -81,9 +81,7 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
         )
     _check_board_found(footage)
     lenses, intrinsics = _intrinsics(folder, footage)
-    corners_px = np.stack(
-        [undistort_points(footage.corners_px[name], lens.K, lens.distortion) for name, lens in lenses.items()]
-    )
+    corners_px = np.stack([undistort_points(footage.corners_px[name], lens) for name, lens in lenses.items()])
     cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
     corners = BoardCorners(tuple(lenses), footage.board.corners_m, corners_px, footage.frame_step, footage.frames)

@@ -75,7 +75,7 @@ def _track(alone: Uncalibrated, name: str, fps: float, lens: Lens | None, scratc
     scale = np.array(capture.recorded_sizes_px[name]) / capture.cameras[name].size_px
     keypoints[..., :2] = keypoints[..., :2] * scale + (scale - 1) / 2
     if lens is not None and name not in capture.recorded_lenses:  # else ingestion undistorted them
-        keypoints = undistort_keypoints(keypoints, lens.K, lens.distortion)
+        keypoints = undistort_keypoints(keypoints, lens)
     footage = alone.footage(name)
     rows = np.searchsorted(footage.frames, capture.frames)
     return Track(frame_times_s(footage, fps)[rows], keypoints)

@@ -245,8 +245,7 @@ def _check_uncertainty(cameras: Sequence[Camera], uncertainty: dict[str, Uncerta
 
 def _as_recorded(capture: Capture, camera: Camera, k1: float) -> Lens:
     """Return a camera of the capture's images as a lens of the recorded files."""
-    width_px, height_px = capture.recorded_sizes_px[camera.name]
-    given = capture.recorded_lenses.get(camera.name)
-    distortion = np.array(given[1]) if given else np.array([k1, 0.0, 0.0, 0.0])
-    K = camera.resized(width_px, height_px).K
-    return Lens(camera.name, K, distortion, camera.R, camera.t_m, (width_px, height_px))
+    size_px = capture.recorded_sizes_px[camera.name]
+    found = Lens(camera.name, camera.resized(*size_px).K, np.array([k1, 0.0, 0.0, 0.0]), camera.R, camera.t_m, size_px)
+    given = capture.recorded_lens(camera.name)
+    return dataclasses.replace(found, distortion=given.distortion, fisheye=given.fisheye) if given else found

@@ -64,9 +64,10 @@ def write_aniposelib(out: Path, lenses: Sequence[Lens]) -> None:
 
 def _numbers(lens: Lens) -> str:
     """Return the lines of a camera that both formats share."""
-    distortions = np.pad(lens.distortion, (0, max(0, 5 - len(lens.distortion)))).tolist()
-    matrix = f"matrix = {lens.K.tolist()}\ndistortions = {distortions}\n"
-    return f"size = {list(known_size(lens))}\n{matrix}fisheye = false\ntranslation = {lens.t_m.tolist()}\n"
+    shortest = 4 if lens.fisheye else 5
+    distortions = np.pad(lens.distortion, (0, max(0, shortest - len(lens.distortion)))).tolist()
+    matrix = f"matrix = {lens.K.tolist()}\ndistortions = {distortions}\nfisheye = {str(lens.fisheye).lower()}\n"
+    return f"size = {list(known_size(lens))}\n{matrix}translation = {lens.t_m.tolist()}\n"
 
 
 def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:

@@ -24,7 +24,7 @@ MAX_BYTES = 256_000_000
 POINT_BYTES = 24  # x, y, number of the 3-D point
 
 # COLMAP's src/colmap/sensor/models.h: a model's number in binary files, and the positions of its parameters among fx fy
-# cx cy k1 k2 p1 p2 k3 k4 k5 k6 (a single focal length is both fx and fy).
+# cx cy k1 k2 p1 p2 k3 k4 k5 k6, for fisheyes fx fy cx cy k1 k2 k3 k4 (a single focal length is both fx and fy).
 FX_FY = (0, 1)
 MODELS: dict[str, tuple[int, tuple[tuple[int, ...], ...]]] = {
     "SIMPLE_PINHOLE": (0, (FX_FY, (2,), (3,))),
@@ -32,7 +32,10 @@ MODELS: dict[str, tuple[int, tuple[tuple[int, ...], ...]]] = {
     "SIMPLE_RADIAL": (2, (FX_FY, (2,), (3,), (4,))),
     "RADIAL": (3, (FX_FY, (2,), (3,), (4,), (5,))),
     "OPENCV": (4, ((0,), (1,), (2,), (3,), (4,), (5,), (6,), (7,))),
+    "OPENCV_FISHEYE": (5, tuple((i,) for i in range(8))),
     "FULL_OPENCV": (6, tuple((i,) for i in range(12))),
+    "SIMPLE_RADIAL_FISHEYE": (8, (FX_FY, (2,), (3,), (4,))),
+    "RADIAL_FISHEYE": (9, (FX_FY, (2,), (3,), (4,), (5,))),
 }
 MODEL_NAMES = {number: name for name, (number, _) in MODELS.items()}
 Parsed = TypeVar("Parsed")
@@ -47,10 +50,11 @@ class _Shot(NamedTuple):
 
 
 class _Optics(NamedTuple):
-    """One camera of a model: its intrinsics fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6."""
+    """One camera of a model: its intrinsics fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6, or fx fy cx cy k1 k2 k3 k4."""
 
     size_px: tuple[int, int]
     values: np.ndarray
+    fisheye: bool
 
 
 class Colmap(EasyMocap):
@@ -103,6 +107,8 @@ def _colmap_parameters(lens: Lens) -> tuple[str, list[float]]:
     if abs(K[0, 1]) > MAX_SKEW_PX:
         raise InputError(f"camera {lens.name}: has skew, which COLMAP's models lack; export another format")
     linear = [K[0, 0], K[1, 1], K[0, 2] + PIXEL_CENTRE, K[1, 2] + PIXEL_CENTRE]
+    if lens.fisheye:
+        return "OPENCV_FISHEYE", linear + distortion
     if not any(distortion):
         return "PINHOLE", linear
     if not any(distortion[4:]):
@@ -113,6 +119,7 @@ def _colmap_parameters(lens: Lens) -> tuple[str, list[float]]:
 def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
     """Return the lens of one image. Raises InputError if its camera cannot be used."""
     fx, fy, cx, cy = optics.values[:4]
+    coefficients = 4 if optics.fisheye else 8 if optics.values[9:].any() else 5
     quaternion = np.array(shot.pose[:4])
     norm = np.linalg.norm(quaternion)
     if not 0.5 < norm < 2:
@@ -121,11 +128,12 @@ def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
         source=sources[0],
         name=check_camera_name(PurePosixPath(shot.name.split("/")[0]).stem, sources[1]),
         K=np.array([[fx, 0, cx - PIXEL_CENTRE], [0, fy, cy - PIXEL_CENTRE], [0, 0, 1]]),
-        distortion=optics.values[4:] if optics.values[9:].any() else optics.values[4:9],
+        distortion=optics.values[4 : 4 + coefficients],
         R=Rotation.from_quat(quaternion / norm, scalar_first=True).as_matrix(),
         t_m=np.array(shot.pose[4:]),
         size_px=optics.size_px,
         extrinsics=sources[1],
+        fisheye=optics.fisheye,
     )
 
 
@@ -210,4 +218,4 @@ def _optics(model: str, width_px: int, height_px: int, parameters: tuple[float, 
     values = np.zeros(12)
     for value, place in zip(parameters, MODELS[model][1], strict=True):
         values[list(place)] = value
-    return _Optics((width_px, height_px), values)
+    return _Optics((width_px, height_px), values, model.endswith("FISHEYE"))

@@ -80,7 +80,10 @@ def _natural_order(path: Path) -> list[str | int]:
 
 
 def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:
-    """Write `intri.yml` and `extri.yml`, as text: OpenCV's own writer refuses names like `Camera (1)`."""
+    """Write `intri.yml` and `extri.yml`, as text: OpenCV's own writer refuses names like `Camera (1)`. Raises
+    InputError on a fisheye, whose coefficients EasyMocap would take for k1 k2 p1 p2."""
+    if fisheye := next((lens for lens in lenses if lens.fisheye), None):
+        raise InputError(f"camera {fisheye.name}: is a fisheye, which intri.yml cannot express; export another format")
     names = "".join(f'   - "{lens.name}"\n' for lens in lenses)
     intri = extri = f"%YAML:1.0\n---\nnames:\n{names}"
     for lens in lenses:

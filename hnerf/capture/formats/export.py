@@ -23,10 +23,12 @@ def write_cameras(out: Path, lenses: Sequence[Lens], layout: str) -> None:
 
 
 def write_calibration(out: Path, lenses: Sequence[Lens], source: str, layouts: Sequence[str], pose2sim: bool) -> None:
-    """Write new cameras where a capture's folder holds them: in `intri.yml` and `extri.yml` or, for the Pose2Sim
-    layout, in `calibration/Calib_<source>.toml`; and in further layouts of WRITERS."""
+    """Write new cameras where a capture's folder holds them: in `intri.yml` and `extri.yml` or, with a fisheye among
+    them, in `calibration.toml`; for the Pose2Sim layout, in `calibration/Calib_<source>.toml`; and in further layouts
+    of WRITERS."""
     if pose2sim:
         write_cameras(out / "calibration", lenses, "aniposelib")
         (out / "calibration" / "calibration.toml").rename(out / "calibration" / f"Calib_{source}.toml")
-    for layout in {*layouts} if pose2sim else {"easymocap", *layouts}:
+    own = "aniposelib" if any(lens.fisheye for lens in lenses) else "easymocap"
+    for layout in {*layouts} if pose2sim else {own, *layouts}:
         write_cameras(out, lenses, layout)

@@ -51,8 +51,8 @@ def lens_from_table(source: Path, key: str, table: dict[str, Any]) -> Lens:
     """Return the lens in one camera's table, from the keys that aniposelib, Pose2Sim and Caliscope share. It is called
     `key` unless the table has a name. Raises InputError if a key is missing or wrong."""
     try:
-        if table.get("fisheye", False):
-            raise InputError(f"{source}: camera {key[:80]}: fisheye lenses are not supported; undistort its video")
+        if (fisheye := table.get("fisheye", False)) not in (True, False):
+            raise ValueError(fisheye)
         width_px, height_px = table["size"]
         return checked_lens(
             source=source,
@@ -62,6 +62,7 @@ def lens_from_table(source: Path, key: str, table: dict[str, Any]) -> Lens:
             R=np.array(table["rotation"], dtype=np.float64),
             t_m=np.array(table["translation"], dtype=np.float64),
             size_px=(float(width_px), float(height_px)),
+            fisheye=bool(fisheye),
         )
     except KeyError as error:
         raise InputError(f"{source}: camera {key[:80]}: {error} is missing; calibrate again") from None

@@ -215,9 +215,15 @@ def test_a_lens_is_given_for_images_of_the_recorded_size(tmp_path: Path) -> None
     """Images of 2000 px were shrunk to 1000 px: the focal length doubles, and the middle at 499.5 becomes 999.5."""
     capture = write_capture(tmp_path, ring(1), detections(ring(1), 0.0))
     capture = dataclasses.replace(capture, recorded_sizes_px={"c0": (2000, 2000)})
-    lens = calibrate._as_recorded(capture, capture.cameras["c0"], -0.1)
+    posed = capture.cameras["c0"]
+    lens = calibrate._as_recorded(capture, posed, -0.1)
     np.testing.assert_allclose(lens.K, [[2000, 0, 999.5], [0, 2000, 999.5], [0, 0, 1]])
     assert lens.size_px == (2000, 2000) and lens.distortion.tolist() == [-0.1, 0, 0, 0]
+    given = ([[2000.0, 0, 999.5], [0, 2000, 999.5], [0, 0, 1]], [0.1, 0.2, 0.3, 0.4])
+    for stored, fisheye in ((given, False), ((*given, True), True)):
+        lens = calibrate._as_recorded(dataclasses.replace(capture, recorded_lenses={"c0": stored}), posed, 0.0)
+        assert lens.fisheye == fisheye and lens.distortion.tolist() == [0.1, 0.2, 0.3, 0.4]
+        assert lens.size_px == (2000, 2000) and lens.K.tolist() == given[0]
 
 
 def refusal(tmp_path: Path, cameras: list[Camera], seen: np.ndarray, unknown: list[str]) -> str:

@@ -13,11 +13,11 @@ from flows.cli import main
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap, write_colmap
 from hnerf.capture.formats.easymocap import EasyMocap
-from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.formats.export import write_calibration, write_cameras
 from hnerf.capture.formats.layout import Layout
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest, recognise
-from hnerf.capture.lens import Lens
+from hnerf.capture.lens import Lens, distort_points
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture import recordings as rec
@@ -38,6 +38,7 @@ LENSES = [
     Lens("cam_5", np.array([[20.0, 0, 11.5], [0, 20, 7.5], [0, 0, 1]]), np.array([0.5, 0, 0, 0.01, 0, 0.25, 0, 0.1]),
          np.eye(3), np.zeros(3), (24, 16)),
 ]  # fmt: skip
+FISHEYE = dataclasses.replace(LENSES[1], name="cam_6", distortion=np.array([0.1, -0.05, 0.02, -0.01]), fisheye=True)
 
 
 def write_model(folder: Path, binary: bool = False) -> Path:
@@ -85,7 +86,7 @@ def test_a_colmap_model_is_read(binary: bool, tmp_path: Path) -> None:
     [
         ("cameras.bin", 0, struct.pack("<Q", 1 << 60), "not a COLMAP model"),  # number of cameras
         ("images.bin", 0, struct.pack("<Q", 1 << 60), "not a COLMAP model"),  # number of images
-        ("cameras.bin", 12, struct.pack("<i", 5), "other cameras than SIMPLE_PINHOLE"),  # OPENCV_FISHEYE
+        ("cameras.bin", 12, struct.pack("<i", 7), "other cameras than SIMPLE_PINHOLE"),  # FOV
         ("cameras.bin", 16, struct.pack("<Q", 1 << 40), "declares 1.09951e.12 x 480 px"),  # width
         ("images.bin", 86, struct.pack("<Q", 1 << 60), "not a COLMAP model"),  # number of points, after the name
         ("images.bin", 12, struct.pack("<d", float("nan")), "its quaternion is not of length 1"),
@@ -134,17 +135,39 @@ def test_a_rational_colmap_lens_is_read(tmp_path: Path) -> None:
     assert Colmap(tmp_path).lenses()["01"].distortion.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
 
 
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL_FISHEYE 500", "RADIAL_FISHEYE 500", "OPENCV_FISHEYE 500 510"])
+def test_a_colmap_fisheye_images_points_as_colmap_does(model: str, binary: bool, tmp_path: Path) -> None:
+    """At the first camera's place, (0.8, -0.6, 1) from it: 45 degrees off the axis."""
+    (name, *focal), k = model.split(), {"S": "-0.1", "R": "-0.1 0.03", "O": "-0.1 0.03 0.02 0.01"}[model[0]]
+    cameras = CAMERAS_TXT.replace(
+        "SIMPLE_RADIAL 640 480 500 320 240 0.1", f"{name} 640 480 {' '.join(focal)} 320 240 {k}"
+    )
+    folder = write_model(tmp_path)
+    (folder / "sparse" / "0" / "cameras.txt").write_text(cameras)
+    (folder / "sparse" / "0" / "points3D.txt").write_text("")
+    colmap = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    if binary:
+        to_binary(folder / "sparse" / "0")
+    lens = Colmap(folder).lenses()["01"]
+    ray = np.array([0.8, -0.6, 1.0])
+    seen = colmap.image(7).project_point(lens.R.T @ (ray - lens.t_m)) - 0.5
+    assert lens.fisheye and distort_points((lens.K @ ray)[None, :2], lens)[0] == pytest.approx(seen, abs=1e-9)
+
+
 @pytest.mark.parametrize(
     ("layout", "reader"),
     [("colmap", Colmap), ("caliscope", Caliscope), ("aniposelib", Caliscope), ("easymocap", EasyMocap)],
 )
 def test_written_cameras_are_read_back(layout: str, reader: type[Layout], tmp_path: Path) -> None:
-    write_cameras(tmp_path, LENSES, layout)
+    lenses = LENSES if layout == "easymocap" else [*LENSES, FISHEYE]
+    write_cameras(tmp_path, lenses, layout)
     assert type(recognise(tmp_path)) is reader
     read = recognise(tmp_path).lenses()
-    assert list(read) == [lens.name for lens in LENSES]
-    for lens in LENSES:
+    assert list(read) == [lens.name for lens in lenses]
+    for lens in lenses:
         found = read[lens.name]
+        assert found.fisheye == lens.fisheye
         assert np.allclose(found.K, lens.K, atol=1e-12) and found.size_px == lens.size_px
         assert np.allclose(found.R, lens.R, atol=1e-12) and np.allclose(found.t_m, lens.t_m, atol=1e-12)
         padded = [np.pad(d, (0, 8 - len(d))) for d in (found.distortion, lens.distortion)]
@@ -176,6 +199,18 @@ def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path) -> None:
     assert list(recognise(tmp_path).lenses()) == ["cam_0", "cam_1", "cam_2"]
 
 
+def test_a_fisheye_cannot_be_written_for_easymocap(tmp_path: Path) -> None:
+    """A new calibration with one is written in TOML, which is then the folder's calibration."""
+    with pytest.raises(
+        InputError, match=r"^camera cam_6: is a fisheye, which intri\.yml cannot express; export another"
+    ):
+        write_cameras(tmp_path, [*LENSES, FISHEYE], "easymocap")
+    assert list(tmp_path.iterdir()) == []
+    write_calibration(tmp_path, [LENSES[0], FISHEYE], "person", (), False)
+    assert [path.name for path in tmp_path.iterdir()] == ["calibration.toml"]
+    assert [lens.fisheye for lens in recognise(tmp_path).lenses().values()] == [False, True]
+
+
 def test_skew_cannot_be_written_for_colmap(tmp_path: Path) -> None:
     K = np.array([[1000.0, 40, 500], [0, 1000, 500], [0, 0, 1]])  # 40 px at one focal length off the axis
     with pytest.raises(InputError, match="camera 01: has skew"):
@@ -189,14 +224,16 @@ def test_a_colmap_model_cut_short_by_a_full_disk_is_an_error(tmp_path: Path) -> 
 
 def test_colmap_projects_to_the_same_pixels(tmp_path: Path) -> None:
     """A point that projects to pixel (319.5, 239.5) here projects to (320, 240) there."""
-    write_cameras(tmp_path, LENSES, "colmap")
+    lenses = [*LENSES, FISHEYE, dataclasses.replace(FISHEYE, name="cam_7", distortion=np.zeros(4))]
+    write_cameras(tmp_path, lenses, "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
-    assert [model.cameras[i].model.name for i in (1, 2, 3, 4)] == ["FULL_OPENCV", "OPENCV", "PINHOLE", "FULL_OPENCV"]
+    names = [model.cameras[i].model.name for i in range(1, 7)]
+    assert names == ["FULL_OPENCV", "OPENCV", "PINHOLE", "FULL_OPENCV", "OPENCV_FISHEYE", "OPENCV_FISHEYE"]
     on_axis = LENSES[0].R.T @ (np.array([0, 0, 2.0]) - LENSES[0].t_m)
     assert model.image(1).project_point(on_axis).tolist() == pytest.approx([320, 240])
     beside = np.array([0.3, 0.2, 2.0])
-    for number, lens in enumerate(LENSES, start=1):
-        uv = cv2.projectPoints(beside, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0].ravel()
+    for number, lens in enumerate(lenses, start=1):
+        uv = distort_points((lens.K @ beside)[None, :2] / beside[2], lens)[0]
         assert model.image(number).project_point(lens.R.T @ (beside - lens.t_m)) == pytest.approx(uv + 0.5)
 
 
