@@ -362,6 +362,8 @@ FAULTS = (
     Fault("normalise-keypoints", "capture/normalise", "* scale + (scale - 1) / 2", "* scale", "capture/ingest"),
     Fault("lens-distortion", "capture/normalise", "if lens.distorts:", "if np.any(lens.distortion[2:]):",
           "capture/ingest"),
+    Fault("fisheye-start", "calibration/boards/fisheye", "np.abs(off_px(x)).mean()", "x[0]"),
+    Fault("fisheye-deviation", "calibration/boards/fisheye", "variance = 2 * found.cost", "variance = found.cost / 9"),
     Fault("fisheye-beyond", "capture/lens", "straight[tangents > MAX_TANGENT] = np.nan", "pass"),
     Fault("fisheye-recorded", "capture/capture", ", *[True] * lens.fisheye", "", "capture/ingest"),
     Fault("frames-split", "capture/manifest", "train = recorded[: len(recorded) - len(novel)]",

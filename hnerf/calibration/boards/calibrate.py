@@ -176,8 +176,8 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
             lenses[name], words[name] = found.reliable_lens, f"from {source.path.name}/: {found.certainty}"
             if not found.describes_corners:
                 log.warning(
-                    "%s: corners are off by %.1f px (RMS), too much for its lens to be right; undistort its video if "
-                    "it is a fisheye, else film a flat, sharp board",
+                    "%s: corners are off by %.1f px (RMS), too much for its lens to be right, also as a fisheye; film "
+                    "a flat, sharp board, or undistort its video",
                     source.path / name,
                     found.rms_px,
                 )

@@ -1,10 +1,12 @@
 """Intrinsics of one camera from images of a board, and whether the images suffice."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from hnerf.calibration.boards.fisheye import fit_fisheye
 from hnerf.calibration.boards.rig import fixes_pose
 from hnerf.capture.lens import Lens, known_size
 from hnerf.evenly_spaced import evenly_spaced
@@ -15,8 +17,8 @@ MIN_MOVED = 0.02  # of an image's longer side, by the median corner: pictures of
 MIN_TILTED = 5  # images; boards parallel to the image plane say nothing about the focal length or its error
 TILT_DEG = 15.0
 K3_SIGMAS = 5.0  # standard deviations that k3 must exceed: few lenses need it, and it bends images beyond the corners
-# Of an image's longer side: three times what webcams leave. Equidistant fisheyes of 125 degrees across leave as much;
-# rays are then off by 2 degrees.
+# Of an image's longer side: three times what webcams leave. Equidistant fisheyes of 125 degrees across leave as much
+# with k1 k2 p1 p2 k3; rays are then off by 2 degrees.
 MAX_RMS = 0.0005
 MAX_FOCAL_STD = 0.01  # relative standard deviation up to which a focal length is trusted
 
@@ -40,8 +42,7 @@ class LensEstimate:
 
     @property
     def describes_corners(self) -> bool:
-        """Return whether a lens was found that images the corners where they are, as no lens of this model does for a
-        fisheye."""
+        """Return whether a lens was found that images the corners where they are."""
         return self.lens is not None and self.rms_px <= MAX_RMS * max(known_size(self.lens))
 
     @property
@@ -50,12 +51,14 @@ class LensEstimate:
         if self.lens is None:
             return f"pictures between which the board moved: {self.pictures} where {MIN_PICTURES} are needed"
         known = f"focal length known to {100 * self.focal_std:.1f} %, corners off by {self.rms_px:.2f} px"
-        return f"{self.pictures} pictures of the board, {self.tilted} of them tilted, {known}"
+        kind = "a fisheye, " if self.lens.fisheye else ""
+        return f"{self.pictures} pictures of the board, {self.tilted} of them tilted, {kind}{known}"
 
 
 def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size_px: tuple[int, int]) -> LensEstimate:
     """Estimate intrinsics and distortion k1 k2 p1 p2, and k3 if the images prove it, as those of wide lenses do, from
-    corners_px (F, N, 2) as recorded, NaN where not seen (Zhang 2000).
+    corners_px (F, N, 2) as recorded, NaN where not seen (Zhang 2000). If that does not describe the corners, but a
+    fisheye does, the lens is a fisheye.
 
     The standard deviation is that of the least squares (cv2.calibrateCameraExtended), which takes pictures for
     independent: of those between which the board did not move, only the first is used.
@@ -75,9 +78,19 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
         if needs_k3:
             break
     lens = Lens(name, K, distortion.ravel()[: 5 if needs_k3 else 4], np.eye(3), np.zeros(3), size_px)
-    tilted = sum(abs(cv2.Rodrigues(turn)[0][2, 2]) < np.cos(np.deg2rad(TILT_DEG)) for turn in turns)
     focal_std = float(max(deviation[0, 0] / K[0, 0], deviation[1, 0] / K[1, 1]))
-    return LensEstimate(len(chosen), lens, tilted, focal_std, rms_px)
+    pinhole = LensEstimate(len(chosen), lens, _tilted(turns), focal_std, rms_px)
+    if pinhole.describes_corners:
+        return pinhole
+    shown = [corners_m[s] for s in seen], [corners_px[f, s] for f, s in zip(chosen, seen, strict=True)]
+    lens, turns, focal_std, rms_px = fit_fisheye(name, *shown, size_px)
+    fisheye = LensEstimate(len(chosen), lens, _tilted(turns), focal_std, rms_px)
+    return fisheye if fisheye.describes_corners else pinhole
+
+
+def _tilted(turns: Sequence[np.ndarray]) -> int:
+    """Return how many boards, turned by these rotation vectors, are TILT_DEG or more out of the image plane."""
+    return sum(abs(cv2.Rodrigues(turn)[0][2, 2]) < np.cos(np.deg2rad(TILT_DEG)) for turn in turns)
 
 
 def _moved(corners_px: np.ndarray, least_px: float) -> list[int]:
