@@ -363,6 +363,8 @@ FAULTS = (
     Fault("lens-distortion", "capture/normalise", "if lens.distorts:", "if np.any(lens.distortion[2:]):",
           "capture/ingest"),
     Fault("fisheye-start", "calibration/boards/fisheye", "np.abs(off_px(x)).mean()", "x[0]"),
+    Fault("fisheye-gain", "calibration/boards/lens", "FISHEYE_GAIN = 1.5", "FISHEYE_GAIN = 0.9",
+          seen_by="calibration/boards/calibrate"),
     Fault("fisheye-deviation", "calibration/boards/fisheye", "variance = 2 * found.cost", "variance = found.cost / 9"),
     Fault("fisheye-beyond", "capture/lens", "straight[tangents > MAX_TANGENT] = np.nan", "pass"),
     Fault("fisheye-recorded", "capture/capture", ", *[True] * lens.fisheye", "", "capture/ingest"),

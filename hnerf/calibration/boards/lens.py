@@ -17,9 +17,10 @@ MIN_MOVED = 0.02  # of an image's longer side, by the median corner: pictures of
 MIN_TILTED = 5  # images; boards parallel to the image plane say nothing about the focal length or its error
 TILT_DEG = 15.0
 K3_SIGMAS = 5.0  # standard deviations that k3 must exceed: few lenses need it, and it bends images beyond the corners
-# Of an image's longer side: three times what webcams leave. Equidistant fisheyes of 125 degrees across leave as much
-# with k1 k2 p1 p2 k3; rays are then off by 2 degrees.
-MAX_RMS = 0.0005
+MAX_RMS = 0.0005  # of an image's longer side: three times what webcams leave
+# Times that corners must be closer to a fisheye. With k1 k2 p1 p2 k3, equidistant fisheyes of 100 degrees across leave
+# twice as much, and rays 5 px off; those of 120 leave MAX_RMS, and rays 2 degrees off. Of webcams, this is 1.00.
+FISHEYE_GAIN = 1.5
 MAX_FOCAL_STD = 0.01  # relative standard deviation up to which a focal length is trusted
 
 
@@ -57,8 +58,8 @@ class LensEstimate:
 
 def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size_px: tuple[int, int]) -> LensEstimate:
     """Estimate intrinsics and distortion k1 k2 p1 p2, and k3 if the images prove it, as those of wide lenses do, from
-    corners_px (F, N, 2) as recorded, NaN where not seen (Zhang 2000). If that does not describe the corners, but a
-    fisheye does, the lens is a fisheye.
+    corners_px (F, N, 2) as recorded, NaN where not seen (Zhang 2000). If a fisheye describes the corners, and clearly
+    better, the lens is a fisheye.
 
     The standard deviation is that of the least squares (cv2.calibrateCameraExtended), which takes pictures for
     independent: of those between which the board did not move, only the first is used.
@@ -80,12 +81,11 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
     lens = Lens(name, K, distortion.ravel()[: 5 if needs_k3 else 4], np.eye(3), np.zeros(3), size_px)
     focal_std = float(max(deviation[0, 0] / K[0, 0], deviation[1, 0] / K[1, 1]))
     pinhole = LensEstimate(len(chosen), lens, _tilted(turns), focal_std, rms_px)
-    if pinhole.describes_corners:
-        return pinhole
     shown = [corners_m[s] for s in seen], [corners_px[f, s] for f, s in zip(chosen, seen, strict=True)]
     lens, turns, focal_std, rms_px = fit_fisheye(name, *shown, size_px)
     fisheye = LensEstimate(len(chosen), lens, _tilted(turns), focal_std, rms_px)
-    return fisheye if fisheye.describes_corners else pinhole
+    closer = FISHEYE_GAIN * fisheye.rms_px < pinhole.rms_px
+    return fisheye if closer and fisheye.describes_corners else pinhole
 
 
 def _tilted(turns: Sequence[np.ndarray]) -> int:
