@@ -143,6 +143,7 @@ REGISTRY = (
         *("training.novel_pose_steps=0", "training.seconds=640"),
     ),
     shared("shared-fast-two-threads", "valid-wave", threads=2),
+    shared("shared-fast-300-steps", "valid-wave", "fast", "training.steps=300", threads=2),
     measured("soak", "soak.py", configs=("demo",), threads=2),
     measured("rendering", "rendering.py", "{store}", captures=RENDERED, configs=("fast",), threads=2),
     study("benchmark", "quick", "fast", "paper-small", "nerf", store="{new}", threads=2),
