@@ -14,6 +14,7 @@ from hnerf.capture.footage import Footage, ImageFolder
 from hnerf.capture.formats.layout import Layout, StoredFrame, one_a_file
 from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.lens import Lens, checked_lens
+from hnerf.capture.manifest import read_manifest
 from hnerf.capture.safe_io import path_in_capture, read_mask, shown
 from hnerf.capture.safe_pickle import read_pickled_npy
 from hnerf.errors import InputError
@@ -66,7 +67,12 @@ class ZjuMocap(Layout):
         return read_pickled_npy(self.source)
 
     def lenses(self) -> dict[str, Lens]:
-        """Return one camera for each image of a frame."""
+        """Return one camera for each image of a frame. Raises InputError if capture.toml converts them once more."""
+        if read_manifest(self.folder).metres_per_unit == METRES_PER_UNIT:
+            raise InputError(
+                f"{self.folder / 'capture.toml'}: units: translations in annots.npy count as millimetres anyway; "
+                "remove the line"
+            )
         lenses = {}
         for i, name in enumerate(self.images):
             try:

@@ -58,6 +58,14 @@ def test_cameras_images_and_masks_are_read(folder: Path, tmp_path: Path) -> None
     assert capture.keypoints("Camera_B1") is None and capture.given_poses() is None
 
 
+@pytest.mark.parametrize("units", ['"mm"', "0.001"])
+def test_stating_millimetres_once_more_is_refused(units: str, folder: Path, tmp_path: Path) -> None:
+    (folder / "capture.toml").write_text(f"units = {units}\n")
+    assert rec.refusal(folder, tmp_path / "out") == (
+        f"{folder / 'capture.toml'}: units: translations in annots.npy count as millimetres anyway; remove the line"
+    )
+
+
 def test_cameras_may_lack_masks(folder: Path, tmp_path: Path) -> None:
     """Camera_B1 has none; those of Camera_B2 are in mask/, next to an empty mask_cihp/."""
     (folder / "mask_cihp").rename(folder / "mask")
