@@ -40,10 +40,13 @@ class Caliscope(EasyMocap):
 
 def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
     """Write `camera_array.toml`. Cameras are numbered in their order, unless all are called cam_<number> already
-    (without leading zeros, which TOML numbers do not have). Raises InputError on a lens without size."""
+    (without leading zeros, which TOML numbers do not have); the log says which is which. Raises InputError on a lens
+    without size."""
     numbers = [lens.name.removeprefix("cam_") for lens in lenses]
     if not all(re.fullmatch("cam_(0|[1-9][0-9]*)", lens.name) for lens in lenses):
         numbers = [str(i) for i in range(len(lenses))]
+        renamed = (f"{lens.name} is cam_{n}" for n, lens in zip(numbers, lenses, strict=True))
+        log.warning("Caliscope numbers cameras: %s", ", ".join(renamed))
     tables = (
         f"[cameras.{n}]\ncam_id = {n}\nrotation_count = 0\nignore = false\n"
         f"{_numbers(lens)}rotation = {lens.R.tolist()}\n"

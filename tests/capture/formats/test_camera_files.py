@@ -193,10 +193,12 @@ def test_formats_that_require_an_image_size_are_not_written_without_one(layout: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path) -> None:
+def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The file has no room for names: the log says which camera a number is."""
     names = ("cam_01", "cam_08", "cam_10")
     write_cameras(tmp_path, [dataclasses.replace(a, name=b) for a, b in zip(LENSES, names, strict=False)], "caliscope")
     assert list(recognise(tmp_path).lenses()) == ["cam_0", "cam_1", "cam_2"]
+    assert caplog.messages == ["Caliscope numbers cameras: cam_01 is cam_0, cam_08 is cam_1, cam_10 is cam_2"]
 
 
 def test_a_fisheye_cannot_be_written_for_easymocap(tmp_path: Path) -> None:
