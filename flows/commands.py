@@ -16,7 +16,7 @@ from typing import Any
 from flows.settings_list import settings_list
 from hnerf.config import Settings, SyntheticSettings, load_settings, overridden
 from hnerf.errors import InputError
-from hnerf.files import atomic_folder
+from hnerf.files import atomic_folder, require_new
 
 DEMO = Path("demo")
 
@@ -293,6 +293,7 @@ def _show(table: Path) -> None:
 
 def render(options: argparse.Namespace) -> None:
     """Render images and video of a trained person."""
+    require_new(options.out)  # before imports and files that take seconds
     from hnerf.render.subject import RenderOptions, render_subject
 
     _require_intact(options.subject, [options.motion] if options.motion else [])
@@ -324,6 +325,7 @@ def view(options: argparse.Namespace) -> None:
 def export(options: argparse.Namespace) -> None:
     """Export the asset of a trained person again, with other settings or more motions."""
     _check_section(options, "asset")
+    require_new(options.out)  # before imports and files that take seconds
     from hnerf.asset.subject import export_subject
     from tasks.store import recording_digest
 

@@ -69,7 +69,7 @@ def verify(options: argparse.Namespace) -> None:
     print(f"checked: {found.artifacts} artifacts, {found.files} files, {_size(found.size_bytes)}")
     if found.lines:
         remedy = "repeat the `hnerf run` of what is damaged, or let `hnerf store gc --yes` remove what nobody needs"
-        raise InputError(f"{options.store}: {len(found.lines)} faults; {remedy}")
+        raise InputError(f"{options.store}: faults: {len(found.lines)}; {remedy}")
 
 
 def gc(options: argparse.Namespace) -> None:
@@ -90,8 +90,10 @@ def gc(options: argparse.Namespace) -> None:
         left = len(garbage) - len(removed)
         in_use = f"; {left} came into use meanwhile" if left else ""
         print(f"removed: {len(removed)} of {len(garbage)}, {size}{in_use}")
-    else:
+    elif garbage:
         print(f"not needed: {len(garbage)}, {size}; nothing was removed: give --yes to remove")
+    else:
+        print("not needed: nothing")
 
 
 def export(options: argparse.Namespace) -> None:

@@ -20,14 +20,19 @@ def atomic_folder(out: Path) -> Iterator[Path]:
 
     It lies next to `out`, in the same file system. Raises InputError if `out` exists.
     """
-    if os.path.lexists(out):
-        raise InputError(f"{out}: exists; give the name of a new folder")
+    require_new(out)
     with made_folder(out.parent), tempfile.TemporaryDirectory(dir=out.parent, prefix=f"{out.name}.partial-") as beside:
         partial = Path(beside) / out.name  # unlike `beside`, it has the permissions of the umask
         partial.mkdir()
         with naming_full_disk(out):
             yield partial
         os.replace(partial, out)
+
+
+def require_new(out: Path) -> None:
+    """Raise InputError if `out` exists."""
+    if os.path.lexists(out):
+        raise InputError(f"{out}: exists; give the name of a new folder")
 
 
 @contextmanager

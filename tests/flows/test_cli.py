@@ -407,7 +407,8 @@ import sys
 from contextlib import suppress
 from flows.cli import main
 other_section = ["export", ".", "--set", "training.steps=3"]
-for arguments in (["--help"], ["run", "--help"], ["run", "absent"], ["run"], ["settings"], other_section):
+taken = [[command, ".", "--out", "."] for command in ("render", "export")]
+for arguments in (["--help"], ["run", "--help"], ["run", "absent"], ["run"], ["settings"], other_section, *taken):
     with suppress(SystemExit):
         main(arguments)
     heavy = {"torch", "prefect", "warp", "cv2", "numpy", "scipy", "rich"} & set(sys.modules)

@@ -50,13 +50,15 @@ def test_nothing_is_removed_without_yes(store: Store, capsys: pytest.CaptureFixt
     assert "checked: 12 artifacts, 14 files, 102 B" in capsys.readouterr().out
     assert main(["store", "gc", "--yes"]) == 0
     assert capsys.readouterr().out.endswith("removed: 6 of 6, 51 B\n")
+    assert main(["store", "gc"]) == 0
+    assert capsys.readouterr().out == "not needed: nothing\n"
     assert main(["store", "verify"]) == 0
 
 
 def test_verify_reports_damage_as_an_error(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     next(store.root.glob("fit/*/deep/letters")).unlink()
     assert main(["store", "verify", "ada"]) == 2
-    assert capsys.readouterr().err.startswith("hnerf: store: 1 faults")
+    assert capsys.readouterr().err.startswith("hnerf: store: faults: 1; ")
 
 
 def test_export_and_import(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
