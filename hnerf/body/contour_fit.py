@@ -3,7 +3,8 @@
 There are two kinds of match, both point to line (Chen and Medioni 1992, in the image): every point of the mask's
 contour pulls the nearest rim vertex of the projected body, and every rim vertex outside the mask is pushed back in. A
 body belongs inside its clothes, so the second is strict, while the first is loose and robust: cloth and hair stand away
-from the skin. Where a mask lacks a limb, vertices far outside push no harder than those a little outside (Huber 1964).
+from the skin. Where a mask lacks a limb, vertices far outside push no harder than those a little outside (Huber 1964),
+and none do around a keypoint that the mask lacks: otherwise limbs that all masks lack would shrink.
 """
 
 import logging
@@ -37,6 +38,8 @@ MIN_NORMAL_COSINE = 0.5  # between the outlines' normals above which points may 
 GROUND_STD_M = 0.01  # of the height of a frame's lowest vertex above the ground
 GROUND_OUTLIER_M = 0.15  # height of a body that does not stand on the ground
 MAX_SOLE_M = 0.05  # between the skin and the ground
+LACKED_CONFIDENCE, LACKED_M = 0.5, 0.02  # of a keypoint that a mask lacks, and how far outside the mask it is
+LACKED_REACH_M = 0.3  # of the part that the mask lacks around it: from the wrist to the fingertips or the elbow
 BORDER_PX = 2.0  # margin at the image border, where every mask ends
 UNDERSIDE_M = 0.015  # height above the lowest vertex up to which others may touch the ground
 HUBER = 1.345  # standard deviations beyond which residuals push no harder; 95 % efficient on Gaussian noise
@@ -90,12 +93,15 @@ def _resampled(line: np.ndarray, spacing_px: float) -> np.ndarray:
 
 
 def match(
-    camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray,
-    settings: FitSettings,
+    camera: Camera, edge: Outline, keypoints: np.ndarray, scale_m: float, vertices_m: np.ndarray, normals: np.ndarray,
+    faces: np.ndarray, settings: FitSettings,
 ) -> ContourResiduals:  # fmt: skip
-    """Return the residuals of one camera and frame. scale_m: metres a pixel spans; vertices_m and normals (V, 3)."""
+    """Return the residuals of one camera and frame. keypoints (25, 3): x_px, y_px, confidence; scale_m: metres a pixel
+    spans; vertices_m and normals (V, 3)."""
     rim, uv, by_x, normals_2d = rim_in_image(camera, vertices_m, normals, faces)
-    pairs = [_cover(edge, uv, normals_2d), _contain(edge, uv, settings.spacing_m / scale_m)]
+    lacked_px = _lacked(edge, keypoints, scale_m)
+    contained = _contain(edge, uv, settings.spacing_m / scale_m, lacked_px, LACKED_REACH_M / scale_m)
+    pairs = [_cover(edge, uv, normals_2d), contained]
     ids, direction, residual_px = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     gradient = np.einsum("ri,ric->rc", direction, by_x[ids]) * scale_m
     residual_m = residual_px * scale_m
@@ -140,9 +146,17 @@ def _cover(edge: Outline, rim_px: np.ndarray, rim_normals: np.ndarray) -> tuple[
     return nearest[keep], edge.normals[keep], signed[keep]
 
 
-def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _lacked(edge: Outline, keypoints: np.ndarray, scale_m: float) -> np.ndarray:
+    """Return the keypoints (N, 2) px that are surely seen, and that the mask should cover but does not."""
+    seen_px = keypoints[keypoints[:, 2] > LACKED_CONFIDENCE, :2]
+    return seen_px[edge.distance_at(seen_px) * scale_m > LACKED_M]
+
+
+def _contain(
+    edge: Outline, rim_px: np.ndarray, spacing_px: float, lacked_px: np.ndarray, reach_px: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Match rim vertices outside the mask, at most one per cell, to its edge: index, direction (N, 2), distance px
-    (positive)."""
+    (positive). Those within reach_px of keypoints that the mask lacks (N, 2) are left out."""
     width, height = edge.size_px
     seen = np.flatnonzero(((rim_px >= 0) & (rim_px <= (width - 1, height - 1))).all(1))
     column, row = np.floor(rim_px[seen] / spacing_px).astype(np.int64).T
@@ -151,7 +165,7 @@ def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.n
     distance = edge.distance_at(at_px)
     slope = np.stack([edge.distance_at(at_px + step) - edge.distance_at(at_px - step) for step in np.eye(2)], -1)
     slope /= np.linalg.norm(slope, axis=1, keepdims=True).clip(1e-9)
-    out = distance > 0
+    out = (distance > 0) & (cKDTree(lacked_px).query(at_px)[0] > reach_px)
     return first[out], slope[out], distance[out]
 
 
@@ -182,6 +196,7 @@ def _outline_step(
     """Return the pose after one step, the median height of the skin above the ground, and the residuals before the step
     (root mean square, mm). sole_m: that height from the previous step."""
     faces, cameras = pose.rig.faces.numpy(), problem.observations.cameras
+    keypoints = [problem.observations.keypoints(c) for c in range(len(cameras))]
     articulation = Articulation(pose.rig)
     skin = articulation.skin(pose)
     _, equations = problem.assemble(pose)
@@ -190,8 +205,8 @@ def _outline_step(
         vertices_m = articulation.surface(skin, t).numpy()
         normals = normals_of(vertices_m, faces)
         found = [
-            match(camera, edge, float(scale_m[t]), vertices_m, normals, faces, problem.settings)
-            for camera, scale_m, edge in zip(cameras, problem.scale_m, edges[t], strict=True)
+            match(camera, edge, seen[t], float(scale_m[t]), vertices_m, normals, faces, problem.settings)
+            for camera, scale_m, edge, seen in zip(cameras, problem.scale_m, edges[t], keypoints, strict=True)
             if edge is not None
         ]
         if ground is None:

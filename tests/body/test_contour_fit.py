@@ -1,6 +1,5 @@
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,12 +24,13 @@ from hnerf.body.contour_fit import (
 from hnerf.body.descriptor import normals_of
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.config import FitSettings
+from hnerf.geometry.camera import Camera
 from tests.body.recorded_body import ring_camera
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
 SETTINGS = FitSettings(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
-NAKED = partial(match, settings=SETTINGS)
+NO_KEYPOINTS, NONE_PX = np.zeros((25, 3)), np.zeros((0, 2))
 SCALE_M = 3 / 281.6  # metres per pixel at 3 m with the focal length of `ring_camera`
 SEEN_PX = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)  # radius of a ball of 0.2 m in the image
 
@@ -53,7 +53,11 @@ def disc(radius_px: float) -> np.ndarray:
     return x**2 + y**2 < radius_px**2
 
 
-def matched(edge: Outline, match: Callable[..., ContourResiduals] = NAKED) -> tuple[ContourResiduals, np.ndarray]:
+def naked(camera: Camera, edge: Outline, *body: Any, keypoints: np.ndarray = NO_KEYPOINTS) -> ContourResiduals:
+    return match(camera, edge, keypoints, *body, SETTINGS)
+
+
+def matched(edge: Outline, match: Callable[..., ContourResiduals] = naked) -> tuple[ContourResiduals, np.ndarray]:
     """Return the match of a ball of 0.2 m in front of a camera with an outline, and the outward directions of the
     matched vertices."""
     vertices, faces = ball(0.2, 1.0)
@@ -83,7 +87,7 @@ def test_sparse_distance_maps_interpolate_the_full_ones() -> None:
     np.testing.assert_allclose(sparse.distance_at(along_px), full.distance_at(along_px), atol=0.1)
     assert sparse.distance_at(np.array([[300.0, 128]])) == sparse.distance_at(np.array([[255.0, 128]]))
     for edge in (full, sparse):
-        [_], [direction], [distance_px] = _contain(edge, np.array([[200.0, 128]]), 2.0)
+        [_], [direction], [distance_px] = _contain(edge, np.array([[200.0, 128]]), 2.0, NONE_PX, 0.0)
         np.testing.assert_allclose([*direction, distance_px], [1, 0, 52], atol=0.6)
 
 
@@ -99,6 +103,23 @@ def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() ->
         robust = fades if grow_px > 0 else np.minimum(1, holds)
         np.testing.assert_allclose(rows.weight, robust / sigma_m**2)
         assert ((rows.gradient * outwards).sum(1) > 0.9).all()  # moving outwards raises the residual 1:1
+
+
+@pytest.mark.parametrize(
+    ("right_px", "confidence", "lacked"),
+    [(SEEN_PX + 21, 0.6, True), (SEEN_PX + 21, 0.4, False), (SEEN_PX - 4, 0.6, False)],  # the last is 1 cm outside
+)
+def test_nothing_is_pushed_in_around_a_keypoint_that_the_mask_lacks(
+    right_px: float, confidence: float, lacked: bool
+) -> None:
+    """A ball is 5 px larger than its mask. A keypoint 21 px to its right is 0.3 m, 28 px, or less from the ball's right
+    side, and more from its left side."""
+    edge, keypoints = outline(disc(SEEN_PX - 5), 1.0), NO_KEYPOINTS.copy()
+    keypoints[4] = (128 + right_px, 128, confidence)
+    camera, (vertices_m, faces) = ring_camera("a", 0.3), ball(0.2, 1.0)
+    rows = match(camera, edge, keypoints, SCALE_M, vertices_m, normals_of(vertices_m, faces), faces, SETTINGS)
+    aside_px = camera.project(vertices_m[rows.vertices])[0][:, 0] - 128
+    assert aside_px.min() < -16 and (aside_px.max() < 15 if lacked else aside_px.max() > 16)
 
 
 def test_a_body_that_fills_its_mask_is_not_moved() -> None:
@@ -163,7 +184,7 @@ def test_one_vertex_per_cell_is_pushed_back_to_the_mask() -> None:
     inside the disc, one outside the image."""
     edge = outline(disc(20)[:200], 1.0)
     rim_px = np.array([[200.0, 128], [200.4, 128.3], [128, 190], [138, 190], [130, 130], [300, 128]])
-    ids, direction, distance_px = _contain(edge, rim_px, 2.0)
+    ids, direction, distance_px = _contain(edge, rim_px, 2.0, NONE_PX, 0.0)
     assert sorted(ids.tolist()) == [0, 2, 3]
     right, below = ids.tolist().index(0), ids.tolist().index(2)
     np.testing.assert_allclose(direction[[right, below]], [[1, 0], [0, 1]], atol=0.05)
