@@ -344,7 +344,7 @@ FAULTS = (
     Fault("postures-by-group", "body/posture_prior", "slice(first + group * size, first + (group + 1) * size)",
           "slice(first, first + size)"),
     Fault("contour-cells", "body/contour_fit", "np.unique(row * width + column", "np.unique(row + column"),
-    Fault("lacked-limb", "body/contour_fit", "seen_px) * scale_m > LACKED_M", "seen_px) < -LACKED_M"),
+    Fault("lacked-limb", "body/contour_fit", "lacked.sum(0) >= LACKED_SHARE", "lacked.sum(0) > LACKED_SHARE"),
     Fault("contour-shape", "body/contour_fit", "border[frame, :, shape] += weighted_j", "border[frame, :, shape] += j"),
     Fault("cloth-aligned", "body/clothed_fit", "keep = aligned & (", "keep = ("),
     # input: capture formats, segmentation, clocks

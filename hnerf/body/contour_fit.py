@@ -4,7 +4,7 @@ There are two kinds of match, both point to line (Chen and Medioni 1992, in the 
 contour pulls the nearest rim vertex of the projected body, and every rim vertex outside the mask is pushed back in. A
 body belongs inside its clothes, so the second is strict, while the first is loose and robust: cloth and hair stand away
 from the skin. Where a mask lacks a limb, vertices far outside push no harder than those a little outside (Huber 1964),
-and none do around a keypoint that the mask lacks: otherwise limbs that all masks lack would shrink.
+and none do around a keypoint that a camera's masks often lack: otherwise that limb would shrink.
 """
 
 import logging
@@ -39,6 +39,7 @@ GROUND_STD_M = 0.01  # of the height of a frame's lowest vertex above the ground
 GROUND_OUTLIER_M = 0.15  # height of a body that does not stand on the ground
 MAX_SOLE_M = 0.05  # between the skin and the ground
 LACKED_CONFIDENCE, LACKED_M = 0.5, 0.02  # of a keypoint that a mask lacks, and how far outside the mask it is
+LACKED_SHARE = 1 / 3  # of the masks that should show a keypoint: fewer may be errors of the keypoint
 LACKED_REACH_M = 0.3  # of the part that the mask lacks around it: from the wrist to the fingertips or the elbow
 BORDER_PX = 2.0  # margin at the image border, where every mask ends
 UNDERSIDE_M = 0.015  # height above the lowest vertex up to which others may touch the ground
@@ -93,13 +94,12 @@ def _resampled(line: np.ndarray, spacing_px: float) -> np.ndarray:
 
 
 def match(
-    camera: Camera, edge: Outline, keypoints: np.ndarray, scale_m: float, vertices_m: np.ndarray, normals: np.ndarray,
+    camera: Camera, edge: Outline, lacked_px: np.ndarray, scale_m: float, vertices_m: np.ndarray, normals: np.ndarray,
     faces: np.ndarray, settings: FitSettings,
 ) -> ContourResiduals:  # fmt: skip
-    """Return the residuals of one camera and frame. keypoints (25, 3): x_px, y_px, confidence; scale_m: metres a pixel
-    spans; vertices_m and normals (V, 3)."""
+    """Return the residuals of one camera and frame. lacked_px (N, 2): keypoints that the mask lacks; scale_m: metres a
+    pixel spans; vertices_m and normals (V, 3)."""
     rim, uv, by_x, normals_2d = rim_in_image(camera, vertices_m, normals, faces)
-    lacked_px = _lacked(edge, keypoints, scale_m)
     contained = _contain(edge, uv, settings.spacing_m / scale_m, lacked_px, LACKED_REACH_M / scale_m)
     pairs = [_cover(edge, uv, normals_2d), contained]
     ids, direction, residual_px = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
@@ -146,10 +146,16 @@ def _cover(edge: Outline, rim_px: np.ndarray, rim_normals: np.ndarray) -> tuple[
     return nearest[keep], edge.normals[keep], signed[keep]
 
 
-def _lacked(edge: Outline, keypoints: np.ndarray, scale_m: float) -> np.ndarray:
-    """Return the keypoints (N, 2) px that are surely seen, and that the mask should cover but does not."""
-    seen_px = keypoints[keypoints[:, 2] > LACKED_CONFIDENCE, :2]
-    return seen_px[edge.distance_at(seen_px) * scale_m > LACKED_M]
+def lacked_keypoints(keypoints: np.ndarray, scale_m: np.ndarray, edges: list[Outline | None]) -> list[np.ndarray]:
+    """Return the keypoints (N, 2) px that each of a camera's masks lacks, although they are surely seen; only those
+    that many of its masks lack. keypoints (n, 25, 3): x_px, y_px, confidence; scale_m (n,): metres a pixel spans."""
+    seen = (keypoints[..., 2] > LACKED_CONFIDENCE) & np.array([edge is not None for edge in edges])[:, None]
+    lacked = np.zeros_like(seen)
+    for t, edge in enumerate(edges):
+        if edge is not None:
+            lacked[t, seen[t]] = edge.distance_at(keypoints[t, seen[t], :2]) * scale_m[t] > LACKED_M
+    often = lacked.sum(0) >= LACKED_SHARE * seen.sum(0)
+    return [points[rows & often, :2] for points, rows in zip(keypoints, lacked, strict=True)]
 
 
 def _contain(
@@ -178,10 +184,14 @@ def refine_with_outlines(
     standing at height 0, else None; threads: number of frames to process in parallel. Returns the best pose so far when
     a step diverges, as with one camera, whose outlines hardly determine depth.
     """
-    sole_m, steps = 0.0, problem.settings.contour_steps
+    sole_m, steps, seen = 0.0, problem.settings.contour_steps, problem.observations
+    lacked_px = [
+        lacked_keypoints(seen.keypoints(c), problem.scale_m[c].numpy(), [row[c] for row in edges])
+        for c in range(len(seen.cameras))
+    ]
     best, least_mm = pose, math.inf
     for step in tracked(range(steps), "outlines", steps):
-        stepped, sole_m, before_mm = _outline_step(problem, pose, edges, ground, sole_m, threads)
+        stepped, sole_m, before_mm = _outline_step(problem, pose, edges, lacked_px, ground, sole_m, threads)
         log.info("outlines, step %d of %d: %.1f mm rms", step + 1, steps, before_mm)
         if before_mm > DIVERGED * least_mm:
             return best
@@ -191,12 +201,12 @@ def refine_with_outlines(
 
 
 def _outline_step(
-    problem: Problem, pose: Pose, edges: list[list[Outline | None]], ground: int | None, sole_m: float, threads: int
-) -> tuple[Pose, float, float]:
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], lacked_px: list[list[np.ndarray]],
+    ground: int | None, sole_m: float, threads: int,
+) -> tuple[Pose, float, float]:  # fmt: skip
     """Return the pose after one step, the median height of the skin above the ground, and the residuals before the step
-    (root mean square, mm). sole_m: that height from the previous step."""
+    (root mean square, mm). lacked_px: by camera and frame; sole_m: that height from the previous step."""
     faces, cameras = pose.rig.faces.numpy(), problem.observations.cameras
-    keypoints = [problem.observations.keypoints(c) for c in range(len(cameras))]
     articulation = Articulation(pose.rig)
     skin = articulation.skin(pose)
     _, equations = problem.assemble(pose)
@@ -205,8 +215,8 @@ def _outline_step(
         vertices_m = articulation.surface(skin, t).numpy()
         normals = normals_of(vertices_m, faces)
         found = [
-            match(camera, edge, seen[t], float(scale_m[t]), vertices_m, normals, faces, problem.settings)
-            for camera, scale_m, edge, seen in zip(cameras, problem.scale_m, edges[t], keypoints, strict=True)
+            match(camera, edge, lacked[t], float(scale_m[t]), vertices_m, normals, faces, problem.settings)
+            for camera, scale_m, edge, lacked in zip(cameras, problem.scale_m, edges[t], lacked_px, strict=True)
             if edge is not None
         ]
         if ground is None:

@@ -18,6 +18,7 @@ from hnerf.body.contour_fit import (
     _rim,
     _sole_m,
     add_residuals,
+    lacked_keypoints,
     match,
     outline,
 )
@@ -30,7 +31,7 @@ from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
 SETTINGS = FitSettings(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
-NO_KEYPOINTS, NONE_PX = np.zeros((25, 3)), np.zeros((0, 2))
+NONE_PX = np.zeros((0, 2))
 SCALE_M = 3 / 281.6  # metres per pixel at 3 m with the focal length of `ring_camera`
 SEEN_PX = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)  # radius of a ball of 0.2 m in the image
 
@@ -53,15 +54,17 @@ def disc(radius_px: float) -> np.ndarray:
     return x**2 + y**2 < radius_px**2
 
 
-def naked(camera: Camera, edge: Outline, *body: Any, keypoints: np.ndarray = NO_KEYPOINTS) -> ContourResiduals:
-    return match(camera, edge, keypoints, *body, SETTINGS)
+def naked(camera: Camera, edge: Outline, *body: Any, lacked_px: np.ndarray = NONE_PX) -> ContourResiduals:
+    return match(camera, edge, lacked_px, *body, SETTINGS)
 
 
-def matched(edge: Outline, match: Callable[..., ContourResiduals] = naked) -> tuple[ContourResiduals, np.ndarray]:
+def matched(
+    edge: Outline, match: Callable[..., ContourResiduals] = naked, **more: Any
+) -> tuple[ContourResiduals, np.ndarray]:
     """Return the match of a ball of 0.2 m in front of a camera with an outline, and the outward directions of the
     matched vertices."""
     vertices, faces = ball(0.2, 1.0)
-    rows = match(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
+    rows = match(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces, **more)
     return rows, (vertices[rows.vertices] - (0, 0, 1)) / 0.2
 
 
@@ -105,21 +108,26 @@ def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() ->
         assert ((rows.gradient * outwards).sum(1) > 0.9).all()  # moving outwards raises the residual 1:1
 
 
-@pytest.mark.parametrize(
-    ("right_px", "confidence", "lacked"),
-    [(SEEN_PX + 21, 0.6, True), (SEEN_PX + 21, 0.4, False), (SEEN_PX - 4, 0.6, False)],  # the last is 1 cm outside
-)
-def test_nothing_is_pushed_in_around_a_keypoint_that_the_mask_lacks(
-    right_px: float, confidence: float, lacked: bool
-) -> None:
+def test_nothing_is_pushed_in_around_a_keypoint_that_the_mask_lacks() -> None:
     """A ball is 5 px larger than its mask. A keypoint 21 px to its right is 0.3 m, 28 px, or less from the ball's right
     side, and more from its left side."""
-    edge, keypoints = outline(disc(SEEN_PX - 5), 1.0), NO_KEYPOINTS.copy()
-    keypoints[4] = (128 + right_px, 128, confidence)
-    camera, (vertices_m, faces) = ring_camera("a", 0.3), ball(0.2, 1.0)
-    rows = match(camera, edge, keypoints, SCALE_M, vertices_m, normals_of(vertices_m, faces), faces, SETTINGS)
-    aside_px = camera.project(vertices_m[rows.vertices])[0][:, 0] - 128
-    assert aside_px.min() < -16 and (aside_px.max() < 15 if lacked else aside_px.max() > 16)
+    camera, vertices_m = ring_camera("a", 0.3), ball(0.2, 1.0)[0]
+    for lacked_px, rightmost_px in ((NONE_PX, 18), (np.array([[128 + SEEN_PX + 21, 128]]), 14.4)):
+        rows, _ = matched(outline(disc(SEEN_PX - 5), 1.0), lacked_px=lacked_px)
+        aside_px = camera.project(vertices_m[rows.vertices])[0][:, 0] - 128
+        np.testing.assert_allclose([aside_px.min(), aside_px.max()], [-18, rightmost_px], atol=1)
+
+
+def test_keypoints_that_a_third_of_the_masks_lack_are_lacked_there() -> None:
+    """A pixel spans 1 mm. Keypoint 4 is 30 mm outside one of three masks, in a frame without a mask, and without
+    confidence in the last; 5 is 30 mm outside one of four, 6 is 15 mm outside all of them."""
+    edge, keypoints = outline(disc(20), 1.0), np.zeros((5, 25, 3))
+    keypoints[:, 4:7] = 128, 128, 0.6
+    keypoints[0, 4, 0] = keypoints[1, 4, 0] = keypoints[4, 4, 0] = keypoints[3, 5, 0] = 178
+    keypoints[:, 6, 0] = 163
+    keypoints[4, 4, 2] = 0.4
+    found = lacked_keypoints(keypoints, np.full(5, 1e-3), [edge, None, edge, edge, edge])
+    assert [points.tolist() for points in found] == [[[178, 128]], [], [], [], []]
 
 
 def test_a_body_that_fills_its_mask_is_not_moved() -> None:
@@ -271,6 +279,6 @@ def test_steps_that_diverge_are_undone(monkeypatch: pytest.MonkeyPatch) -> None:
     """The third pose fits best, and the fifth more than 1.5 times worse."""
     rms_mm = iter([20.0, 10.0, 9.0, 11.0, 30.0, 40.0])
     monkeypatch.setattr(contour_fit, "_outline_step", lambda problem, pose, *_: (pose + 1, 0.0, next(rms_mm)))
-    problem: Any = SimpleNamespace(settings=FitSettings(contour_steps=6))
+    problem: Any = SimpleNamespace(settings=FitSettings(contour_steps=6), observations=SimpleNamespace(cameras=()))
     first: Any = 0
     assert contour_fit.refine_with_outlines(problem, first, [], None, 1) == 2
