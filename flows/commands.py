@@ -167,6 +167,16 @@ def calibrate(options: argparse.Namespace) -> None:
     read = _calibrate_from_person if options.source == "person" else _calibrate_from_boards
     with atomic_folder(options.out) as partial:
         _read_in_cage(read, options, partial)
+    print(_advice(options.out, options.folder))
+
+
+def _advice(out: Path, folder: Path) -> str:
+    """Return how to use the new cameras in `out` for a capture, in words."""
+    from hnerf.capture.ingest import hiding_calibrations
+
+    advice = f"cameras: {out}; copy its files into {folder} to use them"
+    hiding = " and ".join(map(str, hiding_calibrations(folder, out)))
+    return f"{advice}; remove {hiding}, which would be read instead" if hiding else advice
 
 
 def _calibrate_from_boards(options: argparse.Namespace, out: Path) -> None:
@@ -179,7 +189,6 @@ def _calibrate_from_boards(options: argparse.Namespace, out: Path) -> None:
     for name, camera in report["cameras"].items():
         print(f"{name:<12} {camera['pictures']:>8} {camera['rms_px']:>7.2f}  {camera['intrinsics']}")
     print(f"all: {report['rms_px']:.2f} px RMS\npicture: {options.out / 'boards.png'}")
-    print(f"cameras: {options.out}; copy its files into the capture's folder to use them")
 
 
 def _calibrate_from_person(options: argparse.Namespace, out: Path) -> None:
@@ -192,7 +201,7 @@ def _calibrate_from_person(options: argparse.Namespace, out: Path) -> None:
         off = camera["uncertainty"]
         figures = f"{off['turn_deg']:>10.2f} {100 * off['move_m']:>6.1f} {100 * off['focal']:>10.1f}"
         print(f"{name:<12} {camera['median_px']:>9.2f} {figures}  {camera['intrinsics']}")
-    print("\n".join([*found.notes(), f"cameras: {options.out}; copy its files into {options.folder} to use them"]))
+    print("\n".join(found.notes()))
 
 
 def _is_pose2sim(folder: Path) -> bool:

@@ -4,6 +4,7 @@ import logging
 import unicodedata
 from contextlib import suppress
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import GIVEN_HANDS, KEYPOINTS, Capture, SubjectPoint, stored_lens
 from hnerf.capture.clocks import RATE_TOLERANCE, InStep, in_step, warn_if_uneven
 from hnerf.capture.footage import Footage, Video, VideoFrame
+from hnerf.capture.formats.caliscope import FILES as CALISCOPE_FILES
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
 from hnerf.capture.formats.easymocap import EasyMocap
@@ -149,6 +151,14 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, layout: Layout | 
 def has_calibration(folder: Path) -> bool:
     """Return whether a folder holds a calibration of its cameras, readable or not."""
     return any(layout.recognises(folder) for layout in LAYOUTS if layout is not Videos)
+
+
+def hiding_calibrations(folder: Path, new: Path) -> list[Path]:
+    """Return the files of a capture folder that would be read instead of the calibration in folder `new` once that is
+    copied into it."""
+    marks = (ZjuMocap.mark, PeopleSnapshot.mark, EasyMocap.mark, Colmap.mark, *CALISCOPE_FILES, Pose2Sim.mark)
+    preceding = takewhile(lambda mark: not any(new.glob(mark)), marks)
+    return [path for mark in preceding for path in folder.glob(mark)]
 
 
 def lacks_calibration(folder: Path) -> bool:

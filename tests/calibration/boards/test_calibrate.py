@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flows.commands import _is_pose2sim
+from flows.commands import _advice, _is_pose2sim
 from hnerf.calibration.boards import calibrate as calibration_boards
 from hnerf.calibration.boards.bundle import Adjustment, BoardFit, Poses
 from hnerf.calibration.boards.calibrate import board_evidence, calibrate_from_boards, visible_and_found
@@ -377,6 +377,26 @@ def test_new_cameras_are_the_ones_that_are_read_once_they_are_copied(tmp_path: P
     layout = recognise(folder)
     assert [lens.K[0, 0] for lens in layout.lenses().values()] == [60]
     assert isinstance(layout, Pose2Sim if older is None else EasyMocap)
+
+
+@pytest.mark.parametrize("older", [("easymocap", "colmap"), ("caliscope",), ("aniposelib",), ()])
+def test_what_would_hide_the_cameras_of_a_fisheye_is_named(tmp_path: Path, older: tuple[str, ...]) -> None:
+    """They cannot be in `intri.yml` and `extri.yml`, which precede all other files."""
+    folder, out = tmp_path / "film", tmp_path / "cameras"
+    folder.mkdir()
+    old = Lens("a", np.diag([50.0, 50, 1]), np.zeros(4), np.eye(3), np.zeros(3), (64, 48))
+    for layout in older:
+        write_cameras(folder, [old], layout)
+    write_calibration(out, [dataclasses.replace(old, fisheye=True)], "boards", (), False)
+    advice = f"cameras: {out}; copy its files into {folder} to use them"
+    files = {"easymocap": folder / "extri.yml", "colmap": folder / "sparse", "caliscope": folder / "camera_array.toml"}
+    if hiding := [files[layout] for layout in older if layout in files]:
+        advice += f"; remove {' and '.join(map(str, hiding))}, which would be read instead"
+    assert _advice(out, folder) == advice
+    for number, path in enumerate(hiding):
+        path.rename(tmp_path / f"removed-{number}")
+    shutil.copytree(out, folder, dirs_exist_ok=True)
+    assert [lens.fisheye for lens in recognise(folder).lenses().values()] == [True]
 
 
 def test_a_board_found_in_few_images_is_refused_as_the_wrong_board(
