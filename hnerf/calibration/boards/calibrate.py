@@ -28,7 +28,7 @@ MAX_TILT_DEG = 75.0  # a board tilted further is too slanted to be detected
 MAX_OFF = 0.003  # of an image's longer side, by a camera's median corner: ten times what good footage leaves
 INTRINSICS = ("intri.yml", "camera_array.toml", "calibration.toml")
 WHOLE_CALIBRATIONS = ("sparse", "calibration/Calib*.toml")
-FROM_PERSON = "Calib_person.toml"  # does not say which of its lenses were estimated
+FROM_PERSON = "Calib_person.toml"  # files of another format beside it may not say which lenses were estimated
 
 log = logging.getLogger("hnerf.calibration")
 

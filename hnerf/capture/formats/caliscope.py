@@ -70,7 +70,8 @@ def _numbers(lens: Lens) -> str:
     shortest = 4 if lens.fisheye else 5
     distortions = np.pad(lens.distortion, (0, max(0, shortest - len(lens.distortion)))).tolist()
     matrix = f"matrix = {lens.K.tolist()}\ndistortions = {distortions}\nfisheye = {str(lens.fisheye).lower()}\n"
-    return f"size = {list(known_size(lens))}\n{matrix}translation = {lens.t_m.tolist()}\n"
+    estimated = "estimated = true\n" if lens.estimated else ""
+    return f"size = {list(known_size(lens))}\n{matrix}translation = {lens.t_m.tolist()}\n{estimated}"
 
 
 def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:

@@ -62,6 +62,7 @@ def lens_from_table(source: Path, key: str, table: dict[str, Any]) -> Lens:
             R=np.array(table["rotation"], dtype=np.float64),
             t_m=np.array(table["translation"], dtype=np.float64),
             size_px=(float(width_px), float(height_px)),
+            estimated=table.get("estimated") is True,
             fisheye=bool(fisheye),
         )
     except KeyError as error:

@@ -201,6 +201,13 @@ def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path, caplog: pytest.
     assert caplog.messages == ["Caliscope numbers cameras: cam_01 is cam_0, cam_08 is cam_1, cam_10 is cam_2"]
 
 
+@pytest.mark.parametrize("layout", ["easymocap", "caliscope", "aniposelib"])
+def test_a_lens_that_was_estimated_is_still_marked_when_it_is_read_back(layout: str, tmp_path: Path) -> None:
+    """Else a calibration from a board would take a guess for given."""
+    write_cameras(tmp_path, [LENSES[0], dataclasses.replace(LENSES[1], estimated=True)], layout)
+    assert [lens.estimated for lens in recognise(tmp_path).lenses().values()] == [False, True]
+
+
 def test_a_fisheye_cannot_be_written_for_easymocap(tmp_path: Path) -> None:
     """A new calibration with one is written in TOML, which is then the folder's calibration."""
     with pytest.raises(
