@@ -156,9 +156,10 @@ def has_calibration(folder: Path) -> bool:
 def hiding_calibrations(folder: Path, new: Path) -> list[Path]:
     """Return the files of a capture folder that would be read instead of the calibration in folder `new` once that is
     copied into it."""
-    marks = (ZjuMocap.mark, PeopleSnapshot.mark, EasyMocap.mark, Colmap.mark, *CALISCOPE_FILES, Pose2Sim.mark)
+    easymocap = "[ei][xn]tri.yml"  # later commands read lenses from intri.yml alone, too
+    marks = (ZjuMocap.mark, PeopleSnapshot.mark, easymocap, Colmap.mark, *CALISCOPE_FILES, Pose2Sim.mark)
     preceding = takewhile(lambda mark: not any(new.glob(mark)), marks)
-    return [path for mark in preceding for path in folder.glob(mark)]
+    return [path for mark in preceding for path in sorted(folder.glob(mark))]
 
 
 def lacks_calibration(folder: Path) -> bool:

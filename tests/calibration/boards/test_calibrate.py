@@ -389,8 +389,8 @@ def test_what_would_hide_the_cameras_of_a_fisheye_is_named(tmp_path: Path, older
         write_cameras(folder, [old], layout)
     write_calibration(out, [dataclasses.replace(old, fisheye=True)], "boards", (), False)
     advice = f"cameras: {out}; copy its files into {folder} to use them"
-    files = {"easymocap": folder / "extri.yml", "colmap": folder / "sparse", "caliscope": folder / "camera_array.toml"}
-    if hiding := [files[layout] for layout in older if layout in files]:
+    files = {"easymocap": ["extri.yml", "intri.yml"], "colmap": ["sparse"], "caliscope": ["camera_array.toml"]}
+    if hiding := [folder / name for layout in older for name in files.get(layout, [])]:
         advice += f"; remove {' and '.join(map(str, hiding))}, which would be read instead"
     assert _advice(out, folder) == advice
     for number, path in enumerate(hiding):
