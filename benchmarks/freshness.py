@@ -72,7 +72,8 @@ def stale_reason(root: Path, result: Result, records: Records) -> str | None:
 
 def raised_stages(root: Path, result: Result, commit: str) -> str:
     """Return the stages that the result runs and whose version differs between a commit and HEAD, with both versions:
-    of all stages, only they yield something else now. "none" if no version differs, "-" if the result runs no stage."""
+    of all stages, only they, and those that read what they write, yield something else by the same settings. "none" if
+    no version differs, "-" if the result runs no stage."""
     tasks = [str(path.relative_to(root)) for path in sources(root, result) if path.parent == root / "tasks"]
     was, now = (_stage_versions(root, at, tasks) for at in (commit, "HEAD"))
     raised = [f"{name} {was.get(name, '-')} → {now[name]}" for name in sorted(now) if now[name] != was.get(name)]

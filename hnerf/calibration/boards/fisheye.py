@@ -34,7 +34,8 @@ def fit_fisheye(
     name: str, points_m: Sequence[np.ndarray], points_px: Sequence[np.ndarray], size_px: tuple[int, int]
 ) -> FisheyeFit:
     """Return the fisheye that images the points (N, 3) of each image's board closest to where they were seen (N, 2), in
-    the least squares. Each image must fix its board's pose (`fixes_pose`)."""
+    the least squares. Each image must fix its board's pose (`fixes_pose`) by points inside it, all of which the
+    narrowest guess can undistort."""
     seen_px = np.concatenate(points_px).ravel()
 
     def off_px(unknowns: np.ndarray) -> np.ndarray:
