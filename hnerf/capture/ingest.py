@@ -58,6 +58,7 @@ DEFAULT_FPS = 30.0  # of images, whose files state none
 # Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
 SIZE_TOLERANCE = 0.02
 MIN_KEPT_SHARE = 0.5  # of an undistorted image: a lens loses less than a fifth of it
+IMPLAUSIBLE_LOSS = 0.9  # of a recorded image; an equidistant fisheye of 220 degrees loses 0.67
 MAX_LOST_SHARE = 0.05  # of a recorded image, by undistortion: a wider border can hold hands or feet
 MAX_MISPLACED_SHARE = 0.5  # of keypoints outside their images (detectors guess some there) or in the first pixel
 LAYOUTS: tuple[type[Layout], ...] = (
@@ -397,8 +398,8 @@ def _write_masks(normaliser: Normaliser, masks: dict[int, StoredFrame], out: Pat
 
 
 def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> None:
-    """Raise InputError if most of the undistorted image of (width, height) pixels was never recorded. Warn if it lacks
-    much of what was."""
+    """Raise InputError if most of the undistorted image of (width, height) pixels was never recorded, or if it lacks
+    almost all of what was. Warn if it lacks much of it."""
     if not lens.distorts:
         return
     if (kept := kept_share(lens, size_px)) < MIN_KEPT_SHARE:
@@ -406,7 +407,12 @@ def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> No
             f"{footage}: by the distortion of camera {lens.name}, {1 - kept:.0%} of the picture was never recorded; "
             "calibrate it again"
         )
-    if (lost := lost_share(lens, size_px)) > MAX_LOST_SHARE:
+    if (lost := lost_share(lens, size_px)) > IMPLAUSIBLE_LOSS:
+        raise InputError(
+            f"{footage}: undistortion of camera {lens.name} would cut off {lost:.0%} of the picture; give its K in "
+            "pixels, or calibrate it again"
+        )
+    if lost > MAX_LOST_SHARE:
         log.warning(
             "%s: undistortion of camera %s cuts off the borders, %.0f %% of the picture; keep the person away from "
             "them, or film with a narrower lens",

@@ -305,6 +305,17 @@ def test_a_straight_line_before_a_fisheye_is_ingested_straight(
     assert sum("cuts off the borders" in message for message in caplog.messages) == 2
 
 
+def test_a_fisheye_with_a_focal_length_in_millimetres_is_refused(tmp_path: Path) -> None:
+    """2.2 mm, as if in pixels: of the half-width of 12 px, 2.2 atan(12 / 2.2) = 3.1 px are kept, of the half-height of
+    8 px 2.2 atan(8 / 2.2) = 2.9 px, together 9 % of the picture."""
+    folder = rec.write_easymocap(tmp_path / "ada")
+    lenses = [Lens(n, np.array([[2.2, 0, 11.5], [0, 2.2, 7.5], [0, 0, 1]]), np.zeros(4), np.array(rec.ROTATIONS[n]),
+                   np.array(rec.TRANSLATIONS_M[n]), (24, 16), fisheye=True) for n in rec.CAMERAS]  # fmt: skip
+    (folder / "extri.yml").unlink()
+    write_cameras(folder, lenses, "aniposelib")
+    assert "would cut off 9" in (text := rec.refusal(folder, tmp_path / "out")) and "give its K in pixels" in text
+
+
 def test_undistortion_that_cuts_off_much_of_the_picture_gets_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

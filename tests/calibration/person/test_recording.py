@@ -67,7 +67,8 @@ def test_the_command_calibrates_a_folder_from_the_person(
     fov_deg = str(2 * np.rad2deg(np.arctan(0.5)))  # a focal length of 1000 px
     command = ["calibrate", str(folder), "--from", "person", "--height", "1.8", "--fov", fov_deg, "--out", str(out)]
     assert main(command) == 0
-    assert "a person of 1.80 m" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "a person of 1.80 m" in printed and f"cameras: {out}; copy its files into {folder} to use them\n" in printed
     lenses = (Pose2Sim(out) if pose2sim else EasyMocap(out)).lenses()
     found = align([Camera(c.name, lenses[c.name].K, lenses[c.name].R, lenses[c.name].t_m, 1, 1) for c in truth], truth)
     assert max(np.linalg.norm(a.centre_m - b.centre_m) for a, b in zip(found, truth, strict=True)) < 0.03
