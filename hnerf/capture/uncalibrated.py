@@ -87,7 +87,8 @@ class Uncalibrated(Layout):
         InputError if a file cannot be read."""
         names = [name for name in cameras_without_calibration(self.folder) if self.only in (None, name)]
         own = path_in_capture(self.folder, "intri.yml")
-        file = self.lens_file or (own if own.exists() else None)
+        contradicted = self.calibrated is not None and type(self.calibrated) is not EasyMocap  # by that calibration
+        file = self.lens_file or (own if own.exists() and not contradicted else None)
         read = read_lenses(file) if file else {}
         given = {name: lens for name, lens in read.items() if self.lens_file or not lens.estimated}
         if self.lens_file and not set(given).intersection(names):

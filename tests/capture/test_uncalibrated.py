@@ -11,6 +11,8 @@ from PIL import Image
 from hnerf.capture.capture import SubjectPoint, write_image
 from hnerf.capture.footage import Video
 from hnerf.capture.formats import easymocap
+from hnerf.capture.formats.caliscope import Caliscope
+from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.from_person import FromPerson
 from hnerf.capture.ingest import ingest, lacks_calibration, recognise
 from hnerf.capture.lens import Lens
@@ -107,6 +109,16 @@ def test_a_lens_file_takes_precedence(tmp_path: Path, name: str) -> None:
     assert known["a"].lens.K[0].tolist() == [150, 0, 99] and known["a"].source == f"from {name}"
     assert known["a"].lens.t_m.tolist() == [0, 0, 0] and known["b"].source == "90 degrees given"
     assert known["a"].lens.fisheye == (name == "lenses.toml")
+
+
+def test_intrinsics_are_left_to_the_calibration_that_is_read(tmp_path: Path) -> None:
+    """Else keypoints are undistorted by an old intri.yml, for cameras of a new calibration.toml."""
+    write_images(tmp_path, "a")
+    matrix = "K_a: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [150, 0, 99, 0, 150, 49, 0, 0, 1]\n"
+    (tmp_path / "intri.yml").write_text(f"%YAML:1.0\n---\nnames:\n  - a\n{matrix}")
+    for calibrated, used in ((None, True), (EasyMocap(tmp_path), True), (Caliscope(tmp_path), False)):
+        known = Uncalibrated(tmp_path, only="a", calibrated=calibrated).known_lenses
+        assert (known["a"].source == "from intri.yml") == used
 
 
 def test_lenses_that_a_calibration_estimated_are_used_only_if_their_file_is_named(tmp_path: Path) -> None:
