@@ -8,7 +8,7 @@ from pathlib import Path
 import all as module
 import pytest
 from all import make
-from freshness import load_records
+from freshness import load_records, save_record
 from registry import Result
 
 from tests.benchmarks.checkout import PROGRAM, Checkout, made
@@ -191,6 +191,8 @@ def test_the_list_shows_the_stages_that_have_had_their_version_raised(checkout: 
         path.write_text(path.read_text().replace("9", "10").replace('"1"', '"2"'))
     checkout.commit()
     assert "| one | stale: its code has changed | fit 9 → 10 | " in module.listing(checkout.root, [ONE])[2]
+    save_record(checkout.root, "one", load_records(checkout.root)["one"] | {"commit": "0123456789ab"})
+    assert " | unknown | " in module.listing(checkout.root, [ONE])[2]
 
 
 def test_an_unknown_name_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
