@@ -18,7 +18,7 @@ from tasks.store import Artifact
 log = logging.getLogger("hnerf.fit")
 
 
-@stage("fit", version="37", networks=(FACE_LANDMARKS,))
+@stage("fit", version="38", networks=(FACE_LANDMARKS,))
 def fit(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact | None, settings: FitSettings
 ) -> dict[str, float]:

@@ -344,7 +344,7 @@ FAULTS = (
     Fault("postures-by-group", "body/posture_prior", "slice(first + group * size, first + (group + 1) * size)",
           "slice(first, first + size)"),
     Fault("contour-cells", "body/contour_fit", "np.unique(row * width + column", "np.unique(row + column"),
-    Fault("lacked-limb", "body/contour_fit", "lacked.sum(0) >= LACKED_SHARE", "lacked.sum(0) > LACKED_SHARE"),
+    Fault("lacked-limb", "body/contour_fit", "LACKED_SHARE * sum(", "LACKED_SHARE / 2 * sum("),
     Fault("contour-shape", "body/contour_fit", "border[frame, :, shape] += weighted_j", "border[frame, :, shape] += j"),
     Fault("cloth-aligned", "body/clothed_fit", "keep = aligned & (", "keep = ("),
     # input: capture formats, segmentation, clocks

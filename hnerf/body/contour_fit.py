@@ -39,7 +39,7 @@ GROUND_STD_M = 0.01  # of the height of a frame's lowest vertex above the ground
 GROUND_OUTLIER_M = 0.15  # height of a body that does not stand on the ground
 MAX_SOLE_M = 0.05  # between the skin and the ground
 LACKED_CONFIDENCE, LACKED_M = 0.5, 0.02  # of a keypoint that a mask lacks, and how far outside the mask it is
-LACKED_SHARE = 1 / 3  # of the masks that should show a keypoint: fewer may be errors of the keypoint
+LACKED_SHARE = 1 / 3  # of a camera's masks: fewer may lack a keypoint by its own errors
 LACKED_REACH_M = 0.3  # of the part that the mask lacks around it: from the wrist to the fingertips or the elbow
 BORDER_PX = 2.0  # margin at the image border, where every mask ends
 UNDERSIDE_M = 0.015  # height above the lowest vertex up to which others may touch the ground
@@ -149,12 +149,12 @@ def _cover(edge: Outline, rim_px: np.ndarray, rim_normals: np.ndarray) -> tuple[
 def lacked_keypoints(keypoints: np.ndarray, scale_m: np.ndarray, edges: list[Outline | None]) -> list[np.ndarray]:
     """Return the keypoints (N, 2) px that each of a camera's masks lacks, although they are surely seen; only those
     that many of its masks lack. keypoints (n, 25, 3): x_px, y_px, confidence; scale_m (n,): metres a pixel spans."""
-    seen = (keypoints[..., 2] > LACKED_CONFIDENCE) & np.array([edge is not None for edge in edges])[:, None]
+    seen = keypoints[..., 2] > LACKED_CONFIDENCE
     lacked = np.zeros_like(seen)
     for t, edge in enumerate(edges):
         if edge is not None:
             lacked[t, seen[t]] = edge.distance_at(keypoints[t, seen[t], :2]) * scale_m[t] > LACKED_M
-    often = lacked.sum(0) >= LACKED_SHARE * seen.sum(0)
+    often = lacked.sum(0) >= LACKED_SHARE * sum(edge is not None for edge in edges)
     return [points[rows & often, :2] for points, rows in zip(keypoints, lacked, strict=True)]
 
 

@@ -119,15 +119,16 @@ def test_nothing_is_pushed_in_around_a_keypoint_that_the_mask_lacks() -> None:
 
 
 def test_keypoints_that_a_third_of_the_masks_lack_are_lacked_there() -> None:
-    """A pixel spans 1 mm. Keypoint 4 is 30 mm outside one of three masks, in a frame without a mask, and without
-    confidence in the last; 5 is 30 mm outside one of four, 6 is 15 mm outside all of them."""
+    """A pixel spans 1 mm. Keypoint 4 is 30 mm outside two of four masks, in a frame without a mask, and without
+    confidence in another; 5 is 30 mm outside one of four, and seen in no other; 6 is 15 mm outside all of them."""
     edge, keypoints = outline(disc(20), 1.0), np.zeros((5, 25, 3))
     keypoints[:, 4:7] = 128, 128, 0.6
-    keypoints[0, 4, 0] = keypoints[1, 4, 0] = keypoints[4, 4, 0] = keypoints[3, 5, 0] = 178
+    keypoints[[0, 1, 2, 4], 4, 0] = keypoints[3, 5, 0] = 178
     keypoints[:, 6, 0] = 163
     keypoints[4, 4, 2] = 0.4
+    keypoints[[0, 1, 2, 4], 5, 2] = 0
     found = lacked_keypoints(keypoints, np.full(5, 1e-3), [edge, None, edge, edge, edge])
-    assert [points.tolist() for points in found] == [[[178, 128]], [], [], [], []]
+    assert [points.tolist() for points in found] == [[[178, 128]], [], [[178, 128]], [], []]
 
 
 def test_a_body_that_fills_its_mask_is_not_moved() -> None:
