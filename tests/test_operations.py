@@ -25,6 +25,7 @@ COMMAND = re.compile(r"^    (\S.*?)(?: {2,}# .*)?$", re.MULTILINE)
 NO_COMMANDS = r"store/\S+ {3,}|-p 'overrides|\[Service\]|Environment="
 LEFT_OUT = {
     r"hnerf (ablate|benchmark|stability|demo|synth (ring|walk))": "hours; the same flows on small studies: tests/flows",
+    r"hnerf view": "serves until it is interrupted: tests/render/test_page.py",
     r"hnerf models|git pull": "fetches from registries: make install",
     r"evaluation.holdout=(each|cam03)": "as the third of them, with another camera",
     r"systemctl|loginctl|journalctl|~/.config/systemd": "services: tests/flows/test_systemd_units.py",
