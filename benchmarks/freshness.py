@@ -74,8 +74,8 @@ def raised_stages(root: Path, result: Result, commit: str) -> str:
     """Return the stages that the result runs and whose version differs between a commit and HEAD, with both versions:
     of all stages, only they, and those that read what they write, yield something else by the same settings. "none" if
     no version differs, "-" if the result runs no stage, "unknown" if a shallow clone lacks the commit."""
-    tasks = [str(path.relative_to(root)) for path in sources(root, result) if path.parent == root / "tasks"]
-    was, now = (_stage_versions(root, at, tasks) for at in (commit, "HEAD"))
+    files = [str(path.relative_to(root)) for path in sources(root, result)]
+    was, now = (_stage_versions(root, at, files) for at in (commit, "HEAD"))
     if was is None or now is None:
         return "unknown"
     raised = [f"{name} {was.get(name, '-')} → {now[name]}" for name in sorted(now) if now[name] != was.get(name)]
@@ -122,8 +122,6 @@ def shown_seconds(record: dict[str, Any]) -> str:
 
 def _stage_versions(root: Path, commit: str, files: list[str]) -> dict[str, str] | None:
     """Return the version of each stage that these files declare at a commit, by its name; None without the commit."""
-    if not files:
-        return {}
     command = ["git", "-C", str(root), "grep", "--no-color", "-h", "@stage", commit, "--", *files]
     ended = subprocess.run(command, capture_output=True, text=True)
     return dict(STAGE.findall(ended.stdout)) if ended.returncode <= 1 else None  # 1: no line matches
